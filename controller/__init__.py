@@ -1,0 +1,1 @@
+"""Compliance control of a six-joint arm: types, kinematic model, FDCC and the fast servo loop."""
