@@ -1,0 +1,1 @@
+"""Measurements of our own parts, run by `studio bench`."""
