@@ -95,7 +95,7 @@ class ArmModel:
         jacobian: Array = pin.computeFrameJacobian(
             self.kinematics, self._data, q, self._end, pin.LOCAL_WORLD_ALIGNED
         )
-        return jacobian
+        return jacobian.reshape(6, self.n_joints)  # Pinocchio gives (6,) for a single joint
 
     def inverse_kinematics(
         self,

@@ -72,7 +72,8 @@ def compare_scenario(scenario: Mapping[str, Any], chain: Mapping[str, Any]) -> C
         sensor_frame=scenario["ft_sensor_ref_link"],
     )
     q = np.array(scenario["q0"])
-    target, stiffness, target_wrench = arm.forward_kinematics(q), None, np.zeros(6)
+    target, target_wrench = arm.forward_kinematics(q), np.zeros(6)
+    stiffness = Stiffness.diagonal((500.0, 500.0, 500.0, 50.0, 50.0, 50.0))  # the reference's default
     difference = 0.0
     for k, wrench in enumerate(wrenches):
         event = events.get(k, {})

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from check_fdcc_vectors import compare_scenario, main, read
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from controller.fdcc import Fdcc, FdccConfig
+from controller.fdcc import Fdcc, FdccConfig, virtual_arm
 from controller.model import FLANGE, TCP, ArmModel, Segment, ur5e
 from controller.types import (
     Array,
@@ -113,8 +114,11 @@ def test_restoring_continues_to_the_bit(is_commanded: bool) -> None:
     first, second = Fdcc(ARM, HOME, config), Fdcc(ARM, np.zeros(6), config)
 
     def run(fdcc: Fdcc, seed: int) -> list[bytes]:
-        inputs = _random_inputs(seed, 60)
-        return [fdcc.step(fdcc.q if is_commanded else q, *rest).tobytes() for q, *rest in inputs]
+        commands = []
+        for measured, target, stiffness, sensed, pull in _random_inputs(seed, 60):
+            feedback = fdcc.q if is_commanded else measured
+            commands.append(fdcc.step(feedback, target, stiffness, sensed, pull).tobytes())
+        return commands
 
     run(first, seed=1)
     second.step(HOME, AT_HOME, STIFFNESS)  # another past
@@ -197,6 +201,23 @@ def test_the_pose_error_starts_from_the_last_command() -> None:
     fdcc = Fdcc(ARM, HOME)
     fdcc.step(HOME + 0.01, AT_HOME, STIFFNESS)
     np.testing.assert_array_equal(fdcc.velocity, np.zeros(6))  # from the feedback's pose it would not be zero
+
+
+@pytest.mark.parametrize("n_segments", [6, 8])  # ends at a moving link, which is replaced; at the tool
+def test_the_virtual_arm_weighs_at_its_link_origins(n_segments: int) -> None:
+    """H is the sum of m Jv^T Jv + I Jw^T Jw over the moving links and the end effector."""
+    arm = ArmModel(ARM.base, ARM.segments[:n_segments])
+    expected = np.zeros((6, 6))
+    for k, segment in enumerate(arm.segments, start=1):
+        is_end = k == n_segments
+        if is_end or segment.axis is not None:
+            jacobian = ArmModel(arm.base, arm.segments[:k]).jacobian(HOME[:k])
+            mass, inertia = (1.0, 1.0) if is_end else (0.3, 1e-6)
+            padded = np.pad(jacobian, ((0, 0), (0, 6 - jacobian.shape[1])))
+            expected += mass * padded[:3].T @ padded[:3] + inertia * padded[3:].T @ padded[3:]
+    model = virtual_arm(arm, link_mass=0.3)
+    inertia_matrix = np.triu(pin.crba(model, model.createData(), HOME))
+    np.testing.assert_allclose(inertia_matrix, np.triu(expected), atol=1e-12)
 
 
 @settings(max_examples=20, deadline=None)

@@ -33,7 +33,7 @@ blocks = arrays(float, (3, 3), elements=st.floats(-20.0, 20.0)).map(
 
 
 def _symmetrised(block: Array) -> Array:
-    return (block + block.T) / 2.0
+    return np.asarray((block + block.T) / 2.0)
 
 
 def _assert_same_pose(a: Pose, b: Pose, tolerance: float = 1e-12) -> None:
