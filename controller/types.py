@@ -97,7 +97,7 @@ class Wrench:
 
 @dataclass(frozen=True, slots=True)
 class Stiffness:
-    """Cartesian stiffness at the TCP, base axes: two symmetric positive definite blocks, without coupling."""
+    """Cartesian stiffness at the TCP, in its axes: two symmetric positive definite blocks, uncoupled."""
 
     translational: Array  # (3, 3) [N/m]
     rotational: Array  # (3, 3) [N·m/rad]
@@ -285,6 +285,7 @@ class Step:
     digest: bytes  # hash of the robot's state after the period; empty where a robot has none
     task_state: Mapping[str, Array] | None  # board, object poses, at 20 Hz: the state at observation.time
     snapshot: Snapshot | None  # once a second: the state at observation.time
+    late: float = 0.0  # [s] after its deadline that the period began; 0 where there is no clock
 
 
 def multiply_quaternions(a: Array, b: Array) -> Array:
