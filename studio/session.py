@@ -10,11 +10,14 @@ the bit.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
-from controller.types import Action, Applied, Array, Image, Observation, Snapshot, Step
+from controller.types import Action, Applied, Array, Observation, Snapshot, Step
+
+if TYPE_CHECKING:
+    from studio.tasks import Progress
 
 CONTROL_PERIOD = 0.01  # [s] of one tick
 IMAGE_EVERY = 5  # ticks between images and task states: 20 Hz
@@ -43,8 +46,8 @@ class Robot(Protocol):
     def save(self) -> Snapshot | None:
         """Everything that decides the future, or None for a robot that cannot be restored."""
 
-    def outcome(self) -> bool:
-        """Whether the task counts as done in the present state."""
+    def progress(self) -> Progress:
+        """How far the task is, and whether it counts as done in the present state."""
 
 
 class Agent(Protocol):
@@ -63,11 +66,69 @@ class Subscriber(Protocol):
     def on_step(self, step: Step) -> None: ...
 
 
-class Cameras(Protocol):
-    """Renders or receives images; never raises into the loop."""
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a run ended."""
 
-    def newest(self, observation: Observation) -> Mapping[str, Image]:
-        """The newest image of each camera, given the state now."""
+    reason: Literal["finished", "time limit", "success"]
+    progress: Progress
+    seconds: float  # of the run, in the robot's time
+
+
+class Session:
+    """Lets agents drive one robot. Everything runs on the thread that calls."""
+
+    def __init__(self, robot: Robot, *, realtime: bool = False) -> None:
+        self.robot = robot
+        self.clock = Clock(CONTROL_PERIOD) if realtime else None
+
+    def run(
+        self,
+        agent: Agent,
+        subscribers: Sequence[Subscriber] = (),
+        *,
+        time_limit: float,
+        stop_on_success: bool = False,
+    ) -> Ending:
+        """Let `agent` drive until it is finished or `time_limit` [s] have passed; then the robot holds."""
+        observation = self.robot.observe()
+        start = observation.time
+        agent.reset(observation)
+        reason: Literal["finished", "time limit", "success"] = "time limit"
+        try:
+            for tick in range(round(time_limit / CONTROL_PERIOD)):
+                if not self.tick(tick, agent, subscribers):
+                    reason = "finished"
+                    break
+                if stop_on_success and self.robot.progress().success:
+                    reason = "success"
+                    break
+                if self.clock:
+                    self.clock.wait()
+        finally:
+            self.robot.hold()
+        return Ending(reason, self.robot.progress(), self.robot.observe().time - start)
+
+    def tick(self, tick: int, agent: Agent, subscribers: Sequence[Subscriber] = ()) -> bool:
+        """One control period, the `tick`-th of a take; False where the agent is finished.
+
+        Snapshots, task states and digests are only taken where someone listens.
+        """
+        robot = self.robot
+        observation = robot.observe()
+        requested = agent.act(observation)
+        if requested is None:
+            return False
+        if not subscribers:
+            robot.apply(requested)
+            return True
+        task_state = robot.task_state() if tick % IMAGE_EVERY == 0 else None
+        snapshot = robot.save() if tick % SNAPSHOT_EVERY == 0 else None
+        applied = robot.apply(requested)
+        step = Step(observation, requested, applied, robot.digest(), task_state, snapshot)
+        for subscriber in subscribers:
+            subscriber.on_step(step)
+        return True
 
 
 @dataclass(slots=True)

@@ -1,0 +1,145 @@
+"""What a task is. Each module of this package is one task and ends with a `Task` class.
+
+A task describes its scene (arms, cameras, objects), how an instance is drawn from a seed, when it counts as
+done, and how it can be demonstrated. `load` and `names` find tasks by file, so that a new task is one new
+file here.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+from controller.types import Action, Array, Pose, StiffnessMode
+
+
+@dataclass(frozen=True, slots=True)
+class Grasp:
+    """A part that an arm already holds when an episode starts, by friction between the finger pads."""
+
+    body: str  # name of a body with a free joint
+    flange_from_body: Pose
+    mass: float  # [kg] payload whose weight the F/T sensor compensates
+    center: Array  # (3,) [m] centre of mass in the body's frame
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSetup:
+    """One arm of a task. Base axes are parallel to the world's."""
+
+    name: str  # "left" or "right"
+    base_position: Array  # (3,) [m] in the world
+    flange_from_tcp: Pose
+    world_from_home: Pose  # TCP at the start of an episode, before jitter
+    modes: tuple[StiffnessMode, StiffnessMode]  # the two that the operator switches between
+    workspace: tuple[Array, Array]  # lower and upper corner for the target [m], in the world
+    grasp: Grasp | None = None
+    gripper: float = 1.0  # opening at the start where nothing is held
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """A camera of the scene, fixed in the world or on an arm's flange."""
+
+    name: str
+    position: Array  # (3,) [m] in the world or in the flange frame
+    look_at: Array  # (3,) [m] in the same frame
+    fovy: float  # [deg]
+    arm: str | None = None  # name of the arm that carries it
+    up: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a task is, for the page and the success test."""
+
+    value: float  # 0 .. 1
+    success: bool
+    phase: str  # one or two words for the operator
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The simulation as a task sees it. Only scripts and success tests may read it, never a policy."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    arms: tuple[ArmSetup, ...]
+
+    def pose(self, body: str) -> Pose:
+        """world_from_body."""
+        view = self.data.body(body)
+        return Pose(view.xpos.copy(), view.xquat.copy())
+
+    def tcp(self, arm: str) -> Pose:
+        """world_from_tcp of an arm, as measured."""
+        view = self.data.site(f"{arm}_tcp")
+        return Pose.of(view.xmat.reshape(3, 3), view.xpos)
+
+    def normal_force(self, geom: int, other: int) -> float:
+        """Summed normal force [N] between two geoms, by id."""
+        pairs = self.data.contact.geom
+        touching = ((pairs[:, 0] == geom) & (pairs[:, 1] == other)) | (
+            (pairs[:, 0] == other) & (pairs[:, 1] == geom)
+        )
+        addresses = self.data.contact.efc_address[touching]
+        # An elliptic cone's first row is the normal force.
+        return float(self.data.efc_force[addresses[addresses >= 0]].sum())
+
+
+class Task(Protocol):
+    """One manipulation task. The instance owns what MuJoCo does not hold (ink, phases)."""
+
+    name: str
+    instruction: str
+    arms: tuple[ArmSetup, ...]
+    cameras: tuple[CameraView, ...]
+    time_limit: float  # [s] of an episode
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the scene's bodies; the arms are there already."""
+
+    def bind(self, world: World) -> None:
+        """Called once after compilation: look up ids."""
+
+    def initialize(self, world: World, rng: np.random.Generator, spread: float) -> None:
+        """Draw one instance: place objects, draw marks. `spread` above 1 widens the randomisation."""
+
+    def start_poses(self, rng: np.random.Generator, spread: float) -> tuple[Pose, ...]:
+        """world_from_tcp of each arm at the start."""
+
+    def update(self, world: World) -> None:
+        """After each control period: ink, phases."""
+
+    def progress(self, world: World) -> Progress: ...
+
+    def state(self) -> dict[str, Array]:
+        """Everything that the instance owns, by name; exact."""
+
+    def restore(self, state: Mapping[str, Array]) -> None: ...
+
+    def texture(self) -> tuple[str, Array] | None:
+        """Name of the texture that the task paints and its (h, w, 3) uint8 picture, or None."""
+
+    def demonstrate(self, world: World, rng: np.random.Generator) -> Iterator[Action]:
+        """Actions at the control rate. May read the world; ends when the demonstration is over."""
+
+
+def names() -> list[str]:
+    """All tasks by name."""
+    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
+
+
+def load(name: str) -> Task:
+    """A new instance of the task called `name`."""
+    if name not in names():
+        raise KeyError(f"No task {name!r}; there are {names()}.")
+    module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
+    task: Task = module.Task()
+    return task

@@ -1,0 +1,67 @@
+"""Motions of one arm for scripted demonstrations: minimum-jerk moves between poses at the control rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from controller.stiffness import StiffnessTable, stiffness_of
+from controller.types import (
+    ArmAction,
+    Array,
+    CartesianTarget,
+    Pose,
+    StiffnessMode,
+    multiply_quaternions,
+    quaternion_from_rotation_vector,
+    rotation_vector,
+)
+from studio.session import CONTROL_PERIOD
+
+
+class Motion:
+    """Remembers where one arm's target is, and yields one action per control period towards the next.
+
+    Poses are base_from_tcp. `mode` and `gripper` may be set at any time and hold from the next action on.
+    """
+
+    def __init__(
+        self,
+        start: Pose,
+        mode: StiffnessMode,
+        gripper: float,
+        table: StiffnessTable = "tuned",
+        speed: float = 1.0,
+    ) -> None:
+        self.pose = start
+        self.mode = mode
+        self.gripper = gripper
+        self._table: StiffnessTable = table
+        self._speed = speed  # all durations are divided by it
+
+    def move(self, goal: Pose, seconds: float, linear: bool = False) -> Iterator[ArmAction]:
+        """To `goal` along a straight line: minimum jerk, or at constant speed where `linear`."""
+        start = self.pose
+        turn = rotation_vector(multiply_quaternions(goal.wxyz, start.inverse().wxyz))
+        n = max(1, round(seconds / self._speed / CONTROL_PERIOD))
+        for share in np.arange(1, n + 1) / n:
+            s = float(share if linear else share**3 * (10 - 15 * share + 6 * share**2))
+            self.pose = Pose(
+                start.position + s * (goal.position - start.position),
+                multiply_quaternions(quaternion_from_rotation_vector(s * turn), start.wxyz),
+            )
+            yield self._action()
+
+    def follow(self, points: Array, speed: float) -> Iterator[ArmAction]:
+        """Along the polyline `points` (n, 3) [m] at `speed` [m/s], orientation unchanged."""
+        for point in points:
+            distance = float(np.linalg.norm(point - self.pose.position))
+            yield from self.move(Pose(point, self.pose.wxyz), distance / speed, linear=True)
+
+    def wait(self, seconds: float) -> Iterator[ArmAction]:
+        for _ in range(max(1, round(seconds / self._speed / CONTROL_PERIOD))):
+            yield self._action()
+
+    def _action(self) -> ArmAction:
+        return ArmAction(CartesianTarget(self.pose, stiffness_of(self.mode, self._table)), self.gripper)

@@ -1,0 +1,248 @@
+"""Single-arm wiping: rub a mark off a whiteboard in one go, with the eraser in the hand from the start.
+
+The mark is a curved line along y, at most 3 cm across it, its centre anywhere within 5 cm of the board's
+centre. The eraser is 4.2 cm across the line, so a sweep that ignores where the mark is misses most of them.
+All numbers below were fixed before any policy was trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from controller.types import Action, Array, Pose, StiffnessMode
+from studio.board import Board
+from studio.motion import Motion
+from studio.session import CONTROL_PERIOD
+from studio.tasks import ArmSetup, CameraView, Grasp, Progress, World
+
+BOARD_CENTER = np.array([0.50, 0.0, 0.02])  # [m] top face, in the world
+
+ERASER_HALF = np.array([0.015, 0.021])  # [m] half sides of the felt along tool x and y: 3 cm by 4.2 cm
+FELT_THICKNESS = 0.008  # [m]
+BLOCK_HEIGHT = 0.045  # [m]
+ERASER_MASS = 0.08  # [kg]
+# Soft felt that stays quiet under FDCC and takes the edge off an impact.
+FELT_SOLREF = (0.008, 1.0)
+FELT_SOLIMP = (0.5, 0.95, 0.0015, 0.5, 2.0)
+FELT_FRICTION = (0.2, 0.005, 0.0001)  # more than 0.2 makes the servoed arm hop
+
+MARK_OFFSET = 0.05  # [m] the mark's centre lies within this of the board's centre, in x and in y
+MARK_LENGTH = (0.04, 0.065)  # [m] along y
+MARK_WAVE = (0.008, 0.011)  # [m] amplitude across the line
+MARK_RADIUS = 0.004  # [m] of the pen: the mark is at most 2 (11 + 4) mm = 3 cm across
+START_JITTER = 0.015  # [m] on each axis of the start pose
+
+WIPED_ENOUGH = 0.9  # share of the mark's cells
+LIFTED = 0.3  # [s] without contact that ends the go
+GO_STARTS = 0.02  # share wiped from which touching counts as the go
+
+# The tool points down: tool z = -z, tool x (where the fingers close) = -y, tool y = -x of the world.
+DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FLANGE_FROM_TCP = Pose(np.array([0.0, 0.0, 0.2]), np.array([1.0, 0.0, 0.0, 0.0]))  # the felt's centre
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """How one of two demonstrators wipes."""
+
+    hover: float  # [m] above the board before descending
+    depth: float  # [m] of the target below the board
+    speed: float  # [m/s] of the sweep's target
+    slanted: bool  # descends while moving forward instead of straight down
+
+
+STYLES = (
+    Style(hover=0.045, depth=0.012, speed=0.06, slanted=False),
+    Style(hover=0.070, depth=0.014, speed=0.05, slanted=True),
+)
+
+
+class Task:
+    name = "wiping"
+    instruction = "Wipe the mark off the whiteboard in one go."
+    time_limit = 20.0
+    arms = (
+        ArmSetup(
+            name="right",
+            base_position=np.zeros(3),
+            flange_from_tcp=FLANGE_FROM_TCP,
+            world_from_home=Pose.of(DOWN, np.array([0.36, 0.0, 0.20])),
+            modes=(StiffnessMode.MEDIUM, StiffnessMode.LOW),
+            workspace=(np.array([0.25, -0.25, -0.03]), np.array([0.70, 0.25, 0.45])),
+            grasp=Grasp(
+                body="eraser",
+                flange_from_body=FLANGE_FROM_TCP,
+                mass=ERASER_MASS,
+                center=np.array([0.0, 0.0, -0.0265]),
+            ),
+        ),
+    )
+    cameras = (
+        CameraView("front", np.array([0.92, 0.0, 0.62]), np.array([0.48, 0.0, 0.03]), fovy=34.0),
+        CameraView(
+            "right_wrist",
+            np.array([0.0, -0.11, 0.02]),
+            np.array([0.0, -0.035, 0.2]),
+            fovy=75.0,
+            arm="right",
+            up=np.array([0.0, -1.0, 0.0]),
+        ),
+    )
+
+    def __init__(self) -> None:
+        self.board = Board()
+        self._mark = np.zeros((2, 2))  # (n, 2) [m] polyline in board axes
+        self._cells = 0  # inked cells at the start
+        self._go = 0  # 0 before, 1 during, 2 after the one go
+        self._wiped = 0.0  # share wiped in the go
+        self._airborne = 0.0  # [s] since the last contact
+        self._felt = np.full(3, np.nan)  # (3,) [m] the felt's centre a period ago, in the world
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        Board.build(spec, BOARD_CENTER)
+        eraser = spec.worldbody.add_body(name="eraser", mass=ERASER_MASS)
+        eraser.ipos = self.arms[0].grasp.center if self.arms[0].grasp else (0, 0, 0)
+        eraser.inertia = (4e-5, 3e-5, 2.5e-5)
+        eraser.explicitinertial = True
+        eraser.add_freejoint(name="eraser")
+        eraser.add_geom(
+            name="felt",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(*ERASER_HALF, FELT_THICKNESS / 2),
+            pos=(0, 0, -FELT_THICKNESS / 2),
+            rgba=(0.25, 0.27, 0.30, 1),
+            friction=FELT_FRICTION,
+            solref=FELT_SOLREF,
+            solimp=FELT_SOLIMP,
+            priority=2,
+        )
+        eraser.add_geom(
+            name="block",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(*ERASER_HALF, BLOCK_HEIGHT / 2),
+            pos=(0, 0, -FELT_THICKNESS - BLOCK_HEIGHT / 2),
+            rgba=(0.85, 0.55, 0.20, 1),
+            condim=6,
+        )
+
+    def bind(self, world: World) -> None:
+        self._felt_geom = world.model.geom("felt").id
+        self._board_geom = world.model.geom("board").id
+
+    def start_poses(self, rng: np.random.Generator, spread: float) -> tuple[Pose, ...]:
+        jitter = rng.uniform(-START_JITTER, START_JITTER, 3) * spread
+        home = self.arms[0].world_from_home
+        return (Pose(home.position + jitter, home.wxyz),)
+
+    def initialize(self, world: World, rng: np.random.Generator, spread: float) -> None:
+        center = rng.uniform(-MARK_OFFSET, MARK_OFFSET, 2) * spread
+        length = rng.uniform(*MARK_LENGTH)
+        wave = rng.uniform(*MARK_WAVE)
+        phase, turns = rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.2)
+        along = np.linspace(-0.5, 0.5, 40)
+        across = wave * np.sin(phase + 2 * np.pi * turns * along)
+        across -= (across.min() + across.max()) / 2
+        self._mark = center + np.stack((across, length * along), axis=1)
+        self.board.clear()
+        self.board.draw(self._mark, MARK_RADIUS)
+        self._cells = self.board.inked()
+        self._go, self._wiped, self._airborne = 0, 0.0, 0.0
+        self._felt = world.pose("eraser").position
+
+    def update(self, world: World) -> None:
+        pose = world.pose("eraser")
+        force = world.normal_force(self._felt_geom, self._board_geom)
+        rub = float(np.linalg.norm((pose.position - self._felt)[:2]))
+        self.board.wipe(pose.position - BOARD_CENTER, pose.rotation, ERASER_HALF, 0.0, rub, force)
+        self._felt = pose.position
+        self._airborne = 0.0 if force > 0 else self._airborne + CONTROL_PERIOD
+        wiped = 1.0 - self.board.inked() / max(self._cells, 1)
+        if self._go == 0 and wiped >= GO_STARTS:
+            self._go = 1
+        if self._go == 1:
+            self._wiped = wiped
+            if self._airborne > LIFTED:
+                self._go = 2
+
+    def progress(self, world: World) -> Progress:
+        success = self._wiped >= WIPED_ENOUGH
+        if success:
+            phase = "wiped"
+        elif self._go == 2:
+            phase = "lifted too early"
+        else:
+            phase = ("approach", "wiping")[self._go]
+        return Progress(self._wiped, success, phase)
+
+    def state(self) -> dict[str, Array]:
+        return {
+            **self.board.state(),
+            "mark": self._mark.copy(),
+            "wiping": np.array([self._cells, self._go, self._wiped, self._airborne]),
+            "felt": self._felt.copy(),
+        }
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        self.board.restore(state)
+        self._mark = np.array(state["mark"])
+        cells, go, wiped, airborne = state["wiping"].tolist()
+        self._cells, self._go, self._wiped, self._airborne = int(cells), int(go), wiped, airborne
+        self._felt = np.array(state["felt"])
+
+    def texture(self) -> tuple[str, Array]:
+        return Board.TEXTURE, self.board.picture()
+
+    def demonstrate(self, world: World, rng: np.random.Generator) -> Iterator[Action]:
+        """Hover beside the mark, descend, press at low stiffness, one pass along the line, lift, home."""
+        style = STYLES[rng.integers(len(STYLES))]
+        home = world.tcp("right")
+        hand = Motion(home, StiffnessMode.MEDIUM, gripper=0.0, speed=rng.uniform(0.85, 1.2))
+
+        def jitter(scale: float) -> Array:
+            return np.asarray(rng.normal(0.0, scale, 3) * np.array([1.0, 1.0, 0.3]))
+
+        mark = BOARD_CENTER[:2] + self._mark
+        x = (mark[:, 0].min() + mark[:, 0].max()) / 2
+        # The sweep runs from +y to -y and begins with the felt clear of the mark.
+        clear = ERASER_HALF[0] + MARK_RADIUS
+        begin = np.array([x, mark[:, 1].max() + clear + 0.008, BOARD_CENTER[2]])
+        end = np.array([x, mark[:, 1].min() - clear, BOARD_CENTER[2]])
+        up = np.array([0.0, 0.0, 1.0])
+        tilt = home.wxyz
+        hover = begin + style.hover * up + (np.array([-0.03, 0.02, 0.0]) if style.slanted else 0.0)
+        deep = style.depth * rng.uniform(0.85, 1.15) * up
+        lag = 0.48 * style.speed  # [m] the tool trails the target by this at low stiffness
+
+        for part in (
+            hand.move(Pose(hover + jitter(0.003), tilt), rng.uniform(1.3, 1.7)),
+            hand.move(Pose(begin + 0.006 * up + jitter(0.001), tilt), rng.uniform(0.7, 1.0)),
+            hand.wait(0.35),
+        ):
+            for action in part:
+                yield Action((action,))
+        hand.mode = StiffnessMode.LOW
+        sweep = end - begin
+        steps = np.linspace(0, 1, 5)[1:, None]
+        path = begin - deep + steps * sweep + rng.normal(0, 0.001, (4, 3)) * np.array([1.0, 1.0, 0.3])
+        path[-1] += lag * sweep / np.linalg.norm(sweep)
+        for part in (
+            hand.move(Pose(begin - deep, tilt), 0.5),
+            hand.wait(0.4),
+            hand.follow(path, style.speed),
+            hand.wait(0.2),
+        ):
+            for action in part:
+                yield Action((action,))
+        hand.mode = StiffnessMode.MEDIUM
+        lifted = Pose(path[-1] * np.array([1, 1, 0]) + (BOARD_CENTER[2] + 0.06) * up, tilt)
+        for part in (
+            hand.move(lifted, rng.uniform(0.8, 1.1)),
+            hand.move(home, rng.uniform(1.3, 1.7)),
+            hand.wait(0.8),
+        ):
+            for action in part:
+                yield Action((action,))
