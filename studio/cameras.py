@@ -1,0 +1,163 @@
+"""Camera images, rendered in a process of their own from the twin's state.
+
+The parent sends joint positions and painted textures, the child answers with JPEGs and pixels. No OpenGL is
+ever loaded into the process that carries the robot: where it is missing, hangs or aborts, `RenderedCameras`
+goes dark, says why (`error`) and the robot goes on. The child is `studio.rendering`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from typing import IO, TYPE_CHECKING
+
+import numpy as np
+
+from controller.types import Array, Image
+from studio import tasks
+from studio.rendering import ANSWER, READY, REQUEST
+from studio.session import CONTROL_PERIOD, IMAGE_EVERY
+
+if TYPE_CHECKING:
+    from studio.twin import Twin
+
+HEIGHT, WIDTH = 240, 320  # [px]
+PERIOD = IMAGE_EVERY * CONTROL_PERIOD  # [s]
+START_TIMEOUT = 60.0  # [s] for Python, MuJoCo and the model on a busy machine
+IMAGE_TIMEOUT = 10.0  # [s] a child that takes longer for one set of images is given up
+BACKENDS = ("egl", "osmesa")
+PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
+
+
+class CameraProcess:
+    """The child of one task's scene. Not for two threads at once."""
+
+    def __init__(self, task: str, height: int = HEIGHT, width: int = WIDTH) -> None:
+        """Start it with the first OpenGL that works. Raises RuntimeError with what to install."""
+        self.names = tuple(view.name for view in tasks.load(task).cameras)
+        self._shape = (height, width, 3)
+        reasons = []
+        for backend in BACKENDS:
+            self._child = _start(task, height, width, backend)
+            try:
+                self._read(len(READY), START_TIMEOUT)
+                return
+            except (EOFError, TimeoutError) as error:
+                reasons.append(f"{backend}: {self._last_words() or error}")
+                self.close()
+        raise RuntimeError(
+            f"No camera images: offscreen rendering failed ({'; '.join(reasons)}). "
+            f"On Debian: apt-get install {PACKAGES}"
+        )
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
+
+    def render(self, time: float, qpos: Array, texture: Array | None) -> dict[str, Image]:
+        """One image of each camera at joint positions `qpos`; `texture` (h, w, 3) only where it changed.
+
+        Raises EOFError where the child has died, TimeoutError where it hangs.
+        """
+        pixels = b"" if texture is None else np.ascontiguousarray(texture, np.uint8).tobytes()
+        positions = np.ascontiguousarray(qpos, np.float64).tobytes()
+        try:
+            self._child.stdin.write(REQUEST.pack(time, len(positions), len(pixels)) + positions + pixels)
+            self._child.stdin.flush()
+        except BrokenPipeError:
+            raise EOFError("the camera process has ended") from None
+        return {name: self._read_image(time) for name in self.names}
+
+    def close(self) -> None:
+        """End the child; safe to call twice."""
+        self._child.kill()
+        self._child.wait()
+        for pipe in (self._child.stdin, self._child.stdout, self._child.stderr):
+            if pipe:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+    def _read_image(self, time: float) -> Image:
+        (size,) = ANSWER.unpack(self._read(ANSWER.size, IMAGE_TIMEOUT))
+        jpeg = self._read(size, IMAGE_TIMEOUT)
+        pixels = np.frombuffer(self._read(int(np.prod(self._shape)), IMAGE_TIMEOUT), np.uint8)
+        return Image(time, pixels.reshape(self._shape), jpeg)
+
+    def _read(self, size: int, timeout: float) -> bytes:
+        pipe, parts, deadline = self._child.stdout.fileno(), [], time.monotonic() + timeout
+        while size:
+            if not select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                raise TimeoutError(f"the camera process gave no answer for {timeout:.0f} s")
+            part = os.read(pipe, size)
+            if not part:
+                raise EOFError("the camera process has ended")
+            parts.append(part)
+            size -= len(part)
+        return b"".join(parts)
+
+    def _last_words(self) -> str:
+        self._child.kill()
+        lines = self._child.stderr.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+
+class _Child(subprocess.Popen[bytes]):
+    """A process with all three pipes."""
+
+    stdin: IO[bytes]
+    stdout: IO[bytes]
+    stderr: IO[bytes]
+
+
+def _start(task: str, height: int, width: int, backend: str) -> _Child:
+    return _Child(
+        [sys.executable, "-m", "studio.rendering", task, str(height), str(width)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "MUJOCO_GL": backend},
+    )
+
+
+class RenderedCameras:
+    """Images at 20 Hz of simulated time, rendered while the robot waits: for runs that are not live."""
+
+    def __init__(self, task: str, height: int = HEIGHT, width: int = WIDTH) -> None:
+        self.error: str | None = None  # why there are no images any more
+        self._images: Mapping[str, Image] = {}
+        self._texture: Array = np.empty(0)
+        self._due = 0.0
+        try:
+            self._process: CameraProcess | None = CameraProcess(task, height, width)
+        except RuntimeError as error:
+            self._process, self.error = None, str(error)
+
+    def newest(self, twin: Twin) -> Mapping[str, Image]:
+        """The newest images; rendered afresh where 50 ms have passed since the last, or time went back."""
+        if self._process is None:
+            return {}
+        now = twin.data.time
+        if -PERIOD <= now - self._due < -1e-9 and self._images:
+            return self._images
+        painted = twin.task.texture()
+        texture = painted[1] if painted else None
+        changed = texture is not None and not np.array_equal(texture, self._texture)
+        try:
+            self._images = self._process.render(now, twin.data.qpos, texture if changed else None)
+        except (EOFError, TimeoutError) as error:
+            self.error = f"No more camera images: {error}."
+            self.close()
+            return {}
+        self._texture = self._texture if texture is None else texture
+        self._due = now + PERIOD
+        return self._images
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._process.close()
+        self._process, self._images = None, {}

@@ -1,0 +1,65 @@
+"""The camera process: positions and painted textures in, JPEGs and pixels out.
+
+`python -m studio.rendering TASK HEIGHT WIDTH` reads requests from standard input until it ends. Each is the
+head `REQUEST`, float64 positions and, where it has changed, the painted texture; the answer is, for each
+camera, the head `ANSWER`, a JPEG and the RGB pixels.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+
+import cv2
+import mujoco
+import numpy as np
+
+REQUEST = struct.Struct("<dII")  # time [s], bytes of positions, bytes of texture
+ANSWER = struct.Struct("<I")  # bytes of the JPEG
+READY = b"ready\n"
+JPEG_QUALITY = 90
+
+
+def main(task_name: str, height: int, width: int) -> None:
+    """Answer requests until standard input ends."""
+    from studio import tasks
+    from studio.twin import build_model
+
+    # Libraries may print; the answers need a pipe of their own.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    task = tasks.load(task_name)
+    model = build_model(task)
+    data = mujoco.MjData(model)
+    painted = task.texture()
+    requests = sys.stdin.buffer
+    with mujoco.Renderer(model, height, width) as renderer:
+        answers.write(READY)
+        answers.flush()
+        while len(head := requests.read(REQUEST.size)) == REQUEST.size:
+            data.time, n_positions, n_texture = REQUEST.unpack(head)
+            data.qpos[:] = np.frombuffer(requests.read(n_positions))
+            if n_texture and painted:
+                _upload(renderer, model, painted[0], requests.read(n_texture))
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_camlight(model, data)
+            for view in task.cameras:
+                renderer.update_scene(data, view.name)
+                pixels = renderer.render()
+                _, jpeg = cv2.imencode(".jpg", pixels[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+                answers.write(ANSWER.pack(len(jpeg)) + jpeg.tobytes() + pixels.tobytes())
+            answers.flush()
+
+
+def _upload(renderer: mujoco.Renderer, model: mujoco.MjModel, name: str, pixels: bytes) -> None:
+    texture = model.texture(name).id
+    start = model.tex_adr[texture]
+    model.tex_data[start : start + len(pixels)] = np.frombuffer(pixels, np.uint8)
+    renderer._gl_context.make_current()
+    mujoco.mjr_uploadTexture(model, renderer._mjr_context, texture)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
