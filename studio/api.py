@@ -1,0 +1,210 @@
+"""The headless Python API. The page, the HTTP API and the command line are skins of this one class."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Unpack
+
+from studio import replay as replays
+from studio import tasks
+from studio.catalog import Catalog, Refreshed
+from studio.episode import Episode, Recovery, open_episode, recover_all
+from studio.index import EpisodeRow, Filters
+from studio.inputs.scripted import ScriptedAgent
+from studio.session import Agent
+from studio.station import Station, Take
+from studio.twin import Twin
+
+
+@dataclass(frozen=True, slots=True)
+class DemoReport:
+    """What `Studio.demo` recorded."""
+
+    task: str
+    episodes: int
+    successes: int
+    seeds: list[int]
+    mean_force_N: float  # over the ticks in which the arm felt more than 1 N
+    max_force_N: float
+    ids: list[str]
+    simulated_seconds: float
+    failures: list[dict[str, Any]]  # seed, id, phase and progress of each take without success
+    limits: dict[str, int]  # in how many takes each kind of limit acted
+    images: str  # "yes", "no", or why there are none although asked for
+
+
+class Studio:
+    """One data folder and everything that can be done with it. Close it, or use it in a `with`."""
+
+    def __init__(self, data: str | Path = "data") -> None:
+        self.data_dir = Path(data).absolute()
+        self.catalog = Catalog(self.data_dir)
+
+    def __enter__(self) -> Studio:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.catalog.close()
+
+    # Recording
+
+    def demo(
+        self,
+        task: str,
+        episodes: int = 1,
+        seed: int = 0,
+        *,
+        cameras: bool = True,
+        workers: int = 1,
+        spread: float = 1.0,
+        on_take: Callable[[Take], None] | None = None,
+    ) -> DemoReport:
+        """Record scripted demonstrations of seeds `seed` .. `seed + episodes - 1`.
+
+        More than one worker means processes: a script that calls this needs the usual
+        `if __name__ == "__main__"`.
+        """
+        if episodes < 1 or workers < 1:
+            raise ValueError(f"Episodes and workers must be at least 1, not {episodes} and {workers}.")
+        tasks.load(task)  # an unknown task is refused before anything starts
+        seeds = list(range(seed, seed + episodes))
+        takes: list[Take] = []
+        images = "yes" if cameras else "no"
+        for batch, camera_error in self._demonstrations(task, seeds, cameras, workers, spread):
+            images = camera_error or images
+            for take in batch:
+                self.catalog.add(take.path)
+                takes.append(take)
+                if on_take:
+                    on_take(take)
+        return _report(task, sorted(takes, key=lambda take: take.seed), images)
+
+    def record(
+        self,
+        task: str,
+        make_agent: Callable[[Twin], Agent],
+        *,
+        agent_name: str = "script",
+        seed: int = 0,
+        spread: float = 1.0,
+        cameras: bool = True,
+        operator: str | None = None,
+    ) -> EpisodeRow:
+        """Record one take of any agent; `make_agent` is given the twin that it will drive."""
+        with Station(task, self.data_dir, cameras=cameras) as station:
+            take = station.record(
+                make_agent, agent_name=agent_name, seed=seed, spread=spread, operator=operator
+            )
+        return self.catalog.add(take.path)
+
+    # Takes
+
+    def episodes(self, **filters: Unpack[Filters]) -> list[EpisodeRow]:
+        """All takes that match, newest first; takes that others recorded meanwhile are found."""
+        self.catalog.refresh()
+        return self.catalog.episodes(limit=None, **filters)
+
+    def open(self, episode_id: str) -> Episode:
+        return open_episode(self.catalog.get(episode_id).path)
+
+    def annotate(self, episode_id: str, *, author: str | None = None, **changes: Any) -> EpisodeRow:
+        """Append an edit: outcome, quality, note, trim, add_flags, remove_flags, put_segments …"""
+        return self.catalog.annotate(episode_id, author=author or getpass.getuser(), **changes)
+
+    def delete(self, episode_id: str) -> EpisodeRow:
+        """Move a take to the trash."""
+        return self.catalog.delete(episode_id)
+
+    def restore(self, episode_id: str) -> EpisodeRow:
+        """Bring a take back from the trash."""
+        return self.catalog.restore(episode_id)
+
+    def replay(self, episode_id: str) -> replays.Replay:
+        """Simulate a take again and compare it tick by tick."""
+        with self.open(episode_id) as episode:
+            return replays.replay(episode)
+
+    def recover(self) -> list[Recovery]:
+        """Make takes of the files that a crash left behind; takes being recorded are left alone."""
+        recovered = recover_all(self.data_dir)
+        self.catalog.refresh()
+        return recovered
+
+    def rebuild(self) -> Refreshed:
+        """Read every take again into a fresh index."""
+        return self.catalog.rebuild()
+
+    def _demonstrations(
+        self, task: str, seeds: list[int], cameras: bool, workers: int, spread: float
+    ) -> Iterator[tuple[Sequence[Take], str | None]]:
+        if workers == 1:
+            with Station(task, self.data_dir, cameras=cameras) as station:
+                for seed in seeds:
+                    yield [_demonstrate(station, seed, spread)], station.camera_error
+            return
+        with ProcessPoolExecutor(
+            workers, get_context("spawn"), _open_station, (task, self.data_dir, cameras)
+        ) as pool:
+            for done in as_completed([pool.submit(_demonstrate_here, seed, spread) for seed in seeds]):
+                take, camera_error = done.result()
+                yield [take], camera_error
+
+
+_station: Station  # of a worker process
+
+
+def _open_station(task: str, data_dir: Path, cameras: bool) -> None:
+    global _station
+    _station = Station(task, data_dir, cameras=cameras)
+
+
+def _demonstrate_here(seed: int, spread: float) -> tuple[Take, str | None]:
+    return _demonstrate(_station, seed, spread), _station.camera_error
+
+
+def _demonstrate(station: Station, seed: int, spread: float) -> Take:
+    return station.record(
+        lambda twin: ScriptedAgent(twin, seed),
+        agent_name="scripted",
+        operator="scripted",
+        seed=seed,
+        spread=spread,
+    )
+
+
+def _report(task: str, takes: list[Take], images: str) -> DemoReport:
+    ticks = sum(take.contact_ticks for take in takes)
+    kinds = sorted({kind for take in takes for kind in take.limits})
+    return DemoReport(
+        task=task,
+        episodes=len(takes),
+        successes=sum(take.ending.progress.success for take in takes),
+        seeds=[take.seed for take in takes],
+        mean_force_N=round(sum(take.contact_force_sum for take in takes) / max(ticks, 1), 4),
+        max_force_N=round(max(take.peak_force for take in takes), 4),
+        ids=[take.episode_id for take in takes],
+        simulated_seconds=round(sum(take.ending.seconds for take in takes), 3),
+        failures=[
+            {
+                "seed": take.seed,
+                "id": take.episode_id,
+                "phase": take.ending.progress.phase,
+                "progress": round(take.ending.progress.value, 4),
+            }
+            for take in takes
+            if not take.ending.progress.success
+        ],
+        limits={kind: sum(kind in take.limits for take in takes) for kind in kinds},
+        images=images,
+    )
