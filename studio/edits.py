@@ -311,7 +311,7 @@ def _check_outcome(value: object) -> None:
         raise ValueError(f"Unknown outcome {value!r}; possible are {', '.join(OUTCOMES)}.")
 
 
-def _check_quality(value: object) -> None:
+def check_quality(value: object) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value not in QUALITIES:
         raise ValueError(f"Quality {value!r} is not a whole number from 1 (poor) to 5 (excellent).")
 
@@ -355,7 +355,7 @@ _CHECKS = {
     "time": _check_time,
     "edit_id": _check_word,
     "outcome": _check_outcome,
-    "quality": _check_quality,
+    "quality": check_quality,
     "note": _check_note,
     "trim": _check_trim,
     "add_flags": _check_flags,
