@@ -1,0 +1,271 @@
+"""What the session process and its clients say to each other: commands in, frames and notices out.
+
+Each message is one msgspec struct, tagged by its name, so that a malformed one is refused where it arrives.
+Arrays travel as little-endian float64 bytes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from controller.types import Array
+
+Driver = Literal["nobody", "operator", "script"]
+Level = Literal["ok", "limited", "refused"]  # of the last target: passed, cut back, not followed
+Phase = Literal["idle", "countdown", "recording"]
+Judgement = Literal["success", "failure", "unmarked"]
+
+
+class Message(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """Base of all messages: encoded with its type's name."""
+
+
+NoticeKind = Literal[
+    "info", "warning", "error", "countdown", "recording", "success", "take kept", "take discarded"
+]
+
+# Commands
+
+
+class Reset(Message, frozen=True, kw_only=True):
+    """Draw the instance `seed` of a task; another task is loaded where `task` is given."""
+
+    seed: int
+    task: str | None = None
+    spread: float = 1.0
+
+
+class Drive(Message, frozen=True, kw_only=True):
+    """Let someone drive, or nobody: the arms then hold."""
+
+    driver: Driver
+    operator: str = ""  # the person's name
+
+
+class Engage(Message, frozen=True, kw_only=True):
+    """Connect an arm to the operator's targets, or park it. Engaging never moves it."""
+
+    arm: int
+    engaged: bool
+
+
+class MoveTo(Message, frozen=True, kw_only=True):
+    """The operator's target for an arm, base axes. Newest wins."""
+
+    arm: int
+    position: tuple[float, float, float]  # [m]
+    wxyz: tuple[float, float, float, float]
+
+
+class Nudge(Message, frozen=True, kw_only=True):
+    """Move an arm's target by a step: translation in base axes [m], rotation vector in tool axes [rad]."""
+
+    arm: int
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class SetMode(Message, frozen=True, kw_only=True):
+    arm: int
+    mode: Literal["low", "medium", "high"]
+
+
+class SetGripper(Message, frozen=True, kw_only=True):
+    arm: int
+    opening: float  # 0 closed .. 1 open
+
+
+class Release(Message, frozen=True, kw_only=True):
+    """Let every arm's target run to where the arm is: stop pressing, now."""
+
+
+class StartTake(Message, frozen=True, kw_only=True):
+    countdown: float = 3.0  # [s] before recording
+    operator: str = ""
+
+
+class EndTake(Message, frozen=True, kw_only=True):
+    """Keep the take. Without a judgement the task's own success test counts."""
+
+    judgement: Judgement | None = None
+
+
+class DiscardTake(Message, frozen=True, kw_only=True):
+    """Move the running take, or else the last one, to the trash."""
+
+
+class Collect(Message, frozen=True, kw_only=True):
+    """Record takes of consecutive seeds until `count` are kept; 0 stops collecting."""
+
+    count: int
+    seed: int = 0
+    countdown: float = 3.0
+    operator: str = ""
+
+
+class RestartCameras(Message, frozen=True, kw_only=True):
+    """Start the camera process again."""
+
+
+class Shutdown(Message, frozen=True, kw_only=True):
+    """Keep a running take, hold, and end the process."""
+
+
+Command = (
+    Reset
+    | Drive
+    | Engage
+    | MoveTo
+    | Nudge
+    | SetMode
+    | SetGripper
+    | Release
+    | StartTake
+    | EndTake
+    | DiscardTake
+    | Collect
+    | RestartCameras
+    | Shutdown
+)
+
+# From the session
+
+
+class ArmFrame(msgspec.Struct, frozen=True):
+    """One arm in a frame."""
+
+    base_from_tcp: tuple[float, ...]  # (7,) position [m], wxyz
+    base_from_target: tuple[float, ...]  # (7,) where the servo's target is
+    wrench: tuple[float, ...]  # (6,) [N, N·m] external, about the TCP, base axes
+    stiffness: float  # [N/m] mean translational
+    gripper: float  # 0 closed .. 1 open
+    level: Level
+
+
+class Frame(Message, frozen=True, kw_only=True):
+    """The robot now; newest wins."""
+
+    time: float  # [s] since reset
+    resets: int  # how often the scene was reset: another number is another scene
+    qpos: bytes  # float64 positions of the whole scene
+    arms: tuple[ArmFrame, ...]
+
+
+class ArmStatus(msgspec.Struct, frozen=True):
+    """One arm in the status."""
+
+    name: str
+    mode: str
+    modes: tuple[str, str]  # the two that the task's operator switches between
+    engaged: bool
+    level: Level
+    why: str  # what is limited, for the operator; empty while all passes
+    input_age: float | None  # [s] since the operator's last target; None before the first
+
+
+class TakeStatus(msgspec.Struct, frozen=True):
+    """A take that was recorded."""
+
+    episode_id: str
+    path: str
+    seconds: float
+    outcome: Judgement
+    discarded: bool
+
+
+class Status(Message, frozen=True, kw_only=True):
+    """Everything that is worth a word; newest wins."""
+
+    task: str
+    instruction: str
+    seed: int
+    spread: float
+    resets: int
+    driver: Driver
+    operator: str
+    phase: Phase
+    countdown: float  # [s] left
+    take_seconds: float
+    take_id: str  # of the running take; empty without one
+    take_error: str  # why recording stopped by itself
+    last_take: TakeStatus | None
+    collected: int
+    to_collect: int  # 0 while not collecting
+    progress: float  # 0 .. 1
+    success: bool
+    task_phase: str
+    arms: tuple[ArmStatus, ...]
+    rate: float  # [Hz] of the control loop over the last seconds
+    late_share: float  # of the ticks of the last seconds
+    worst_delay: float  # [s] of the last seconds
+    camera_error: str
+
+
+class CameraImage(Message, frozen=True, kw_only=True):
+    """A camera's newest image."""
+
+    camera: str
+    time: float  # [s] of the state it shows
+    resets: int
+    jpeg: bytes
+
+
+class TaskState(Message, frozen=True, kw_only=True):
+    """The task's own state (ink, phases), where it has changed."""
+
+    resets: int
+    arrays: dict[str, tuple[str, tuple[int, ...], bytes]]  # dtype, shape, bytes
+
+    @staticmethod
+    def of(arrays: dict[str, Array], resets: int) -> TaskState:
+        return TaskState(
+            resets=resets,
+            arrays={
+                name: (a.dtype.str, a.shape, np.ascontiguousarray(a).tobytes()) for name, a in arrays.items()
+            },
+        )
+
+    def unpack(self) -> dict[str, Array]:
+        return {
+            name: np.frombuffer(data, dtype).reshape(shape)
+            for name, (dtype, shape, data) in self.arrays.items()
+        }
+
+
+class Notice(Message, frozen=True, kw_only=True):
+    """Something happened that a person wants to hear; never dropped."""
+
+    kind: Literal[
+        "info", "warning", "error", "take kept", "take discarded", "countdown", "recording", "success"
+    ]
+    text: str
+    take: TakeStatus | None = None
+
+
+Report = Frame | Status | CameraImage | TaskState | Notice
+
+_encoder = msgspec.msgpack.Encoder()
+_commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
+_reports: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)
+
+
+def encode(message: Message) -> bytes:
+    return _encoder.encode(message)
+
+
+def decode_command(data: bytes) -> Command:
+    """Raises msgspec.DecodeError on anything else."""
+    return _commands.decode(data)
+
+
+def decode_report(data: bytes) -> Report:
+    """Raises msgspec.DecodeError on anything else."""
+    return _reports.decode(data)
+
+
+def builtins(message: Message) -> Any:
+    """As JSON can hold it."""
+    return msgspec.to_builtins(message)
