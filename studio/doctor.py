@@ -28,7 +28,7 @@ BACKENDS: tuple[Backend, ...] = ("egl", "osmesa")
 PROJECT = "compact-studio"
 PYTHON = ((3, 11), (3, 14))  # from, below
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-NODE = 20  # oldest major version that the page's libraries are built with
+NODE = 18  # oldest major version that installs the page's libraries: Debian 12 has it
 FREE_DISK = 5e9  # [bytes] an hour of takes with cameras; recording itself stops at 1 GB
 CORES = 2  # one for the session, one for cameras and page
 PATIENCE = 120.0  # [s] for one trial: a first `import torch` from a cold disk is slow
@@ -45,6 +45,11 @@ with mujoco.Renderer(model, 16, 16) as renderer:
     renderer.update_scene(data)
     assert renderer.render().any(), "the image is black"
     print(GL.glGetString(GL.GL_RENDERER).decode())
+"""
+_LIBRARIES = """
+import os
+os.environ["MUJOCO_GL"] = "disable"
+import cv2, mujoco, pinocchio
 """
 _GPU = """
 import torch
@@ -115,6 +120,14 @@ def check_packages() -> Finding:
     return Finding("packages", not lacking, detail, "everything", "make studio" if lacking else "")
 
 
+def check_libraries() -> Finding:
+    try:
+        _python(_LIBRARIES)
+    except subprocess.SubprocessError as error:
+        return Finding("libraries", False, _reason(error), "everything", apt("libgomp1"))
+    return Finding("libraries", True, "pinocchio, mujoco and opencv load", "everything")
+
+
 def check_rendering() -> Finding:
     backend, detail = _rendering()
     remedy = "" if backend else apt("libegl1", "libgl1", "libgl1-mesa-dri")
@@ -180,6 +193,7 @@ def check_cores() -> Finding:
 CHECKS: tuple[Callable[[], Finding], ...] = (
     check_python,
     check_packages,
+    check_libraries,
     check_rendering,
     check_chromium,
     check_node,
