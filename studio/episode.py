@@ -36,10 +36,9 @@ from mcap import records
 
 from controller.types import Action, ArmAction, ArmState, Array, Image, Limit, Pose, Snapshot, Step
 from studio import schema
+from studio.edits import sync_folder
 from studio.mcap_file import EpisodeError, McapFile, McapWriter, read_until_torn
 
-FORMAT_VERSION = 1
-JPEG_QUALITY = 90
 __all__ = [
     "Episode",
     "EpisodeError",
@@ -53,6 +52,8 @@ __all__ = [
     "recover_all",
 ]
 
+FORMAT_VERSION = 1
+JPEG_QUALITY = 90
 PART = ".part"  # behind the name of a take that is being recorded
 VIEW_PERIOD = 1 / 30  # [s] between messages for viewers
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}  # header of version n -> of n + 1
@@ -121,7 +122,9 @@ class Header:
             if "cameras" in given:
                 given["cameras"] = {name: (w, h) for name, (w, h) in given["cameras"].items()}
             return Header(**given, extra={name: v for name, v in fields.items() if name not in known})
-        except (TypeError, KeyError, AttributeError, json.JSONDecodeError) as error:
+        except EpisodeError:
+            raise
+        except (TypeError, KeyError, AttributeError, ValueError) as error:
             raise EpisodeError(f"The header of the take cannot be read: {error}.") from error
 
 
@@ -163,7 +166,7 @@ class EpisodeWriter:
         """Open `path` with ".part" behind it, which `finish` takes off."""
         if path.exists():
             raise FileExistsError(f"{path} exists; takes are never overwritten.")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         self.header = header
         self.path = path
         self.time = 0.0  # [s] since reset: the newest state written
@@ -180,7 +183,7 @@ class EpisodeWriter:
             for arm, base in zip(header.arms, bases or [None] * len(header.arms), strict=True)
         )
         self.sync()
-        _sync_directory(path.parent)
+        sync_folder(path.parent)
 
     def add(self, step: Step, wall: float) -> None:
         """Write one control period, told at the unix time `wall` [s], or raise and write none of it."""
@@ -220,7 +223,7 @@ class EpisodeWriter:
         if {len(observation.arms), len(step.requested.arms), len(step.applied.trace)} != {len(arms)}:
             raise ValueError(f"A step of {len(observation.arms)} arms in a take of {arms}.")
         ns = self._log_time(now)
-        if self._n_ticks == 0:  # the trace of a period begins after its first state
+        if self._n_ticks == 0 and step.applied.trace[0, 0, 0] > now:  # the trace begins after the first state
             yield from self._states(np.stack([_row_of(state)[None] for state in observation.arms]))
         yield from self._states(step.applied.trace)
         yield from self._actions(now, {"requested": step.requested, "applied": step.applied.action})
@@ -257,7 +260,7 @@ class EpisodeWriter:
             if image.time > self._shown.get(camera, -math.inf):
                 self._shown[camera] = image.time
                 ns = self._log_time(image.time)
-                jpeg = schema.compressed_image(ns, camera, image.jpeg or _jpeg_of(image.pixels))
+                jpeg = schema.compressed_image(ns, camera, _jpeg_of(image))
                 yield f"/camera/{camera}", "foxglove.CompressedImage", ns, jpeg
 
     def _log_time(self, at: float) -> int:
@@ -274,11 +277,14 @@ def _row_of(state: ArmState) -> Array:
     return np.concatenate(([state.time], *parts, [state.gripper]))
 
 
-def _jpeg_of(pixels: Array) -> bytes:
-    bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+def _jpeg_of(image: Image) -> bytes:
+    if image.jpeg is not None:
+        return image.jpeg
+    assert image.pixels is not None
+    bgr = cv2.cvtColor(image.pixels, cv2.COLOR_RGB2BGR)
     done, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
-        raise ValueError(f"OpenCV could not encode an image of {pixels.shape} {pixels.dtype}.")
+        raise ValueError(f"OpenCV could not encode an image of {bgr.shape} {bgr.dtype}.")
     return bytes(jpeg)
 
 
@@ -295,9 +301,9 @@ class Episode:
         self._mcap = McapFile(path)
         try:
             self.header = Header.from_json(self._header_text())
-        except BaseException:
+        except EpisodeError as error:
             self._mcap.close()
-            raise
+            raise EpisodeError(f"{path}: {error}") from error
 
     def __enter__(self) -> Episode:
         return self
@@ -433,7 +439,7 @@ class Episode:
     def _header_text(self) -> str:
         entries = self._mcap.metadata(_METADATA)
         if entries is None:
-            raise EpisodeError(f"{self.path} is an MCAP file, but not a take of Studio: it has no header.")
+            raise EpisodeError("This is an MCAP file, but not a take of Studio: it has no header.")
         return entries["header"]
 
     def _parsed(self, topic: str, name: str) -> Iterator[Any]:
@@ -494,7 +500,7 @@ def _copy_readable(torn: IO[bytes], episode: Path) -> float | None:
     header = next(filter(None, map(_header_in, found)), None)
     if header is None:
         return None
-    zero = _log_zero(json.loads(header)["started"])
+    zero = _log_zero(json.loads(header).get("started", 0.0))  # whatever version wrote it
     copy = episode.with_name(episode.name + ".recovering")
     with copy.open("wb") as file:
         mcap = _start(file, header, zero)
@@ -572,7 +578,7 @@ def _put_in_place(file: IO[bytes], written: Path, path: Path) -> None:
     file.flush()
     os.fsync(file.fileno())
     written.rename(path)
-    _sync_directory(path.parent)
+    sync_folder(path.parent)
 
 
 def _put_aside(path: Path, suffix: str) -> Path:
@@ -584,13 +590,12 @@ def _put_aside(path: Path, suffix: str) -> Path:
     raise AssertionError("unreachable")
 
 
-def _sync_directory(directory: Path) -> None:
-    """Put the names in a directory on the disk."""
-    handle = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def _make_folder(folder: Path) -> None:
+    """Make a folder and those above it, on the disk."""
+    if not folder.exists():
+        _make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync_folder(folder.parent)
 
 
 def _log_zero(started: float) -> int:

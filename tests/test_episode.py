@@ -153,6 +153,19 @@ def test_a_tick_finds_its_state_and_its_wall_time(episode: Episode, steps: list[
     assert episode.digests() == [step.digest for step in steps]
 
 
+def test_the_first_state_is_recorded_once(tmp_path: Path, header: Header, steps: list[Step]) -> None:
+    """Also where a robot's trace begins with the state that it observed."""
+    first = steps[0]
+    trace = first.applied.trace.copy()
+    trace[:, :, 0] -= 0.002
+    early = dataclasses.replace(first, applied=dataclasses.replace(first.applied, trace=trace))
+    for name, step in (("late", first), ("early", early)):
+        with open_episode(write(tmp_path / f"{name}.mcap", [step], header)) as episode:
+            times = episode.columns("left/state")["left/state/time"]
+            assert times[0] == 0.0
+            assert np.all(np.diff(times) > 0.001)
+
+
 def test_task_states_and_snapshots_read_back_to_the_bit(episode: Episode, steps: list[Step]) -> None:
     told = [(s.observation.time, s.task_state) for s in steps if s.task_state is not None]
     for (time, read), (recorded_time, recorded) in zip(episode.task_states(), told, strict=True):
@@ -338,7 +351,15 @@ def test_a_newer_take_is_refused_with_a_sentence(tmp_path: Path, header: Header)
 
 
 @pytest.mark.parametrize(
-    "text", ["[]", "{}", '{"format_version": 1}', "not json", '{"format_version": "new"}']
+    "text",
+    [
+        "[]",
+        "{}",
+        '{"format_version": 1}',
+        "not json",
+        '{"format_version": "new"}',
+        '{"format_version": 1, "cameras": {"a": 1}}',
+    ],
 )
 def test_what_is_no_header_is_refused(text: str) -> None:
     with pytest.raises(EpisodeError, match="header of the take cannot be read"):
@@ -370,7 +391,7 @@ def test_a_file_that_is_no_take_is_told_apart(tmp_path: Path, path: Path) -> Non
         (whole[:8], "is torn: its end is missing. `studio recover`"),
         (whole[:-1], "is torn"),
         (whole[: len(whole) // 2], "is torn"),
-        (foreign.getvalue(), "not a take of Studio: it has no header"),
+        (foreign.getvalue(), r"file\.mcap: This is an MCAP file, but not a take of Studio: it has no header"),
         (bytes(damaged), "is damaged"),
     ):
         file = tmp_path / "file.mcap"
