@@ -31,7 +31,7 @@ from studio.episode import PART, EpisodeWriter, Event, Header, Outcome
 SYNC_PERIOD = 0.25  # [s] between writes to the disk: half of what a crash may cost
 GATHER = 0.05  # [s] between looks at the queue: waking up for every step would cost half as much again
 MIN_FREE = 1e9  # [bytes] below which no take starts, and a running one ends
-BACKLOG = 3000  # steps, 30 s: a disk that lags further behind real time has failed
+BACKLOG = 1000  # steps, 10 s, 150 MB with three cameras: a disk that lags further behind has failed
 HEADLESS_BACKLOG = 25  # steps, 0.25 s of simulated time: headless, the session waits for the disk
 
 
