@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -528,7 +529,20 @@ def test_a_data_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
         Catalog(tmp_path / "data")
 
 
-# Several processes.
+# Several threads and processes.
+
+
+def test_threads_that_share_a_catalogue_lose_nothing(data: Path) -> None:
+    make_up(data, 4)
+    with Catalog(data, made_up) as catalog, ThreadPoolExecutor(4) as pool:
+
+        def annotate(number: int) -> None:
+            catalog.annotate(f"take-{number % 4:04d}", author="ann", add_flags=(f"flag{number}",))
+            catalog.refresh()
+            catalog.facets()
+
+        list(pool.map(annotate, range(40)))
+        assert catalog.facets()["flags"] == {f"flag{number}": 1 for number in range(40)}
 
 
 def _work(data: Path, author: str, n_edits: int) -> None:
