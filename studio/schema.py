@@ -451,7 +451,7 @@ def _quaternion(wxyz: Array) -> Any:
 def _turn_x_to(direction: Array) -> Array:
     """wxyz of the shortest turn from +x to a unit vector; identity for the zero vector."""
     x, y, z = direction.tolist()
-    if x < -1 + 1e-9:
-        return np.array([0.0, 0.0, 0.0, 1.0])  # half a turn about z
-    norm = math.sqrt((1 + x) ** 2 + y * y + z * z)
-    return np.array([1 + x, 0.0, -z, y]) / norm
+    sine = math.hypot(y, z)
+    half = math.atan2(sine, x) / 2
+    axis_y, axis_z = (-z / sine, y / sine) if sine > 0 else (0.0, 1.0)  # half a turn: any axis across x
+    return np.array([math.cos(half), 0.0, axis_y * math.sin(half), axis_z * math.sin(half)])

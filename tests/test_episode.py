@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
+import functools
 import io
 import json
 from collections.abc import Iterator, Sequence
@@ -445,13 +446,19 @@ def test_the_schemas_in_the_file_decode_its_messages(path: Path, steps: list[Ste
     ]
 
 
+@functools.cache
+def one_step() -> Step:
+    return next(made_up_steps(1, made_up_header()))
+
+
 @given(force=st.lists(st.floats(-50, 50), min_size=3, max_size=3))
-def test_a_force_arrow_points_along_the_force(steps: list[Step], force: list[float]) -> None:
-    left, right = steps[0].observation.arms
+def test_a_force_arrow_points_along_the_force(force: list[float]) -> None:
+    step = one_step()
+    left, right = step.observation.arms
     pressed = dataclasses.replace(right, wrench=Wrench(np.array(force), np.zeros(3)))
-    seen = dataclasses.replace(steps[0].observation, arms=(left, pressed))
+    seen = dataclasses.replace(step.observation, arms=(left, pressed))
     arms = (schema.ArmView("left", (), None), schema.ArmView("right", ("joint_1",), Pose.identity()))
-    view = {topic: message for topic, _, message in schema.view(0, arms, seen, steps[0].requested)}
+    view = {topic: message for topic, _, message in schema.view(0, arms, seen, step.requested)}
     entity = view["/forces"].entities[1]
     arrow = entity.arrows[0]
     turn = arrow.pose.orientation
