@@ -157,6 +157,11 @@ class ArmServo:
         self.dq_command = (self.q_command - before) / self.config.fast_period
         return self.q_command
 
+    @property
+    def target(self) -> Pose:
+        """base_from_target at the end of the present period; the TCP's command under joint control."""
+        return self._target if self._is_cartesian else self._model.forward_kinematics(self.q_command)
+
     def state(self) -> Array:
         """Everything that decides later commands, flat float64."""
         return np.concatenate(

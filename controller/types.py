@@ -225,8 +225,12 @@ class Image:
     """A camera image and the time of the state that it shows."""
 
     time: float  # [s] since reset
-    pixels: Array  # (h, w, 3) uint8, RGB
+    pixels: Array | None  # (h, w, 3) uint8, RGB; None where only the JPEG has travelled
     jpeg: bytes | None = None  # the same picture, where the sender has encoded it already
+
+    def __post_init__(self) -> None:
+        if self.pixels is None and self.jpeg is None:
+            raise ValueError("An image needs pixels or a JPEG.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +269,7 @@ class Applied:
 
     action: Action  # after limits; where an arm held, the target and stiffness that it held
     limits: tuple[Limit, ...]
-    trace: Array  # (arms, fast steps, ARM_ROW_WIDTH), the last row is the state at the period's end
+    trace: Array  # (arms, fast steps, ARM_ROW_WIDTH): the states before each fast step, the first as observed
 
 
 @dataclass(frozen=True, slots=True)

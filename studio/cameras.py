@@ -12,6 +12,7 @@ import os
 import select
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping
 from typing import IO, TYPE_CHECKING
@@ -20,6 +21,7 @@ import numpy as np
 
 from controller.types import Array, Image
 from studio import tasks
+from studio.channels import Latest
 from studio.rendering import ANSWER, READY, REQUEST
 from studio.session import CONTROL_PERIOD, IMAGE_EVERY
 
@@ -59,17 +61,20 @@ class CameraProcess:
     def pid(self) -> int:
         return self._child.pid
 
-    def render(self, time: float, qpos: Array, texture: Array | None) -> dict[str, Image]:
+    def render(
+        self, time: float, qpos: Array, texture: Array | None, want_pixels: bool = True
+    ) -> dict[str, Image]:
         """One image of each camera at joint positions `qpos`; `texture` (h, w, 3) only where it changed.
 
         Raises EOFError where the child has died, TimeoutError where it hangs.
         """
-        pixels = b"" if texture is None else np.ascontiguousarray(texture, np.uint8).tobytes()
+        painted = b"" if texture is None else np.ascontiguousarray(texture, np.uint8).tobytes()
         positions = np.ascontiguousarray(qpos, np.float64).tobytes()
+        head = REQUEST.pack(len(positions), len(painted), want_pixels)
         try:
-            self._child.stdin.write(REQUEST.pack(time, len(positions), len(pixels)) + positions + pixels)
+            self._child.stdin.write(head + positions + painted)
             self._child.stdin.flush()
-        except BrokenPipeError:
+        except (BrokenPipeError, ValueError):
             raise EOFError("the camera process has ended") from None
         return {name: self._read_image(time) for name in self.names}
 
@@ -83,9 +88,11 @@ class CameraProcess:
                     pipe.close()
 
     def _read_image(self, time: float) -> Image:
-        (size,) = ANSWER.unpack(self._read(ANSWER.size, IMAGE_TIMEOUT))
-        jpeg = self._read(size, IMAGE_TIMEOUT)
-        pixels = np.frombuffer(self._read(int(np.prod(self._shape)), IMAGE_TIMEOUT), np.uint8)
+        n_jpeg, n_pixels = ANSWER.unpack(self._read(ANSWER.size, IMAGE_TIMEOUT))
+        jpeg = self._read(n_jpeg, IMAGE_TIMEOUT)
+        if not n_pixels:
+            return Image(time, None, jpeg)
+        pixels = np.frombuffer(self._read(n_pixels, IMAGE_TIMEOUT), np.uint8)
         return Image(time, pixels.reshape(self._shape), jpeg)
 
     def _read(self, size: int, timeout: float) -> bytes:
@@ -161,3 +168,70 @@ class RenderedCameras:
         if self._process is not None:
             self._process.close()
         self._process, self._images = None, {}
+
+
+class LiveCameras:
+    """Images at up to 20 Hz from a thread of its own: asking for them never waits.
+
+    The thread renders the newest state that was offered; images carry that state's time. Only JPEGs travel.
+    """
+
+    def __init__(self, task: str, height: int = HEIGHT, width: int = WIDTH) -> None:
+        self.error: str | None = None  # why there are no images
+        self._size = (height, width)
+        self._scene = tasks.load(task)  # an instance of its own, to paint the texture from a task state
+        self._offered: Latest[tuple[float, Array, dict[str, Array]]] = Latest()
+        self._wake = threading.Event()
+        self._images: Mapping[str, Image] = {}
+        self._due = 0.0
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
+        self._thread.start()
+
+    def newest(self, twin: Twin) -> Mapping[str, Image]:
+        """The newest images there are; offers the present state for the next where 50 ms have passed."""
+        now = twin.data.time
+        if not -PERIOD <= now - self._due < -1e-9:
+            self._offered.set((now, twin.data.qpos.copy(), twin.task.state()))
+            self._due = now + PERIOD
+            self._wake.set()
+        return self._images
+
+    def clear(self) -> None:
+        """Forget the images of a scene that is gone."""
+        self._images = {}
+
+    def close(self) -> None:
+        self._ended = True
+        self._wake.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        process = None
+        try:
+            process = CameraProcess(self._scene.name, *self._size)
+            self._render(process)
+        except (RuntimeError, EOFError, TimeoutError) as error:
+            self._images = {}
+            self.error = f"No camera images: {error}."
+        finally:
+            if process:
+                process.close()
+
+    def _render(self, process: CameraProcess) -> None:
+        painted: Array = np.empty(0)
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            if self._ended:
+                return
+            offered, _ = self._offered.get()
+            if offered is None:
+                continue
+            time, qpos, state = offered
+            self._scene.restore(state)
+            texture = self._scene.texture()
+            changed = texture is not None and not np.array_equal(texture[1], painted)
+            if texture and changed:
+                painted = texture[1]
+            self._images = process.render(time, qpos, painted if changed else None, want_pixels=False)

@@ -214,7 +214,7 @@ class CameraImage(Message, frozen=True, kw_only=True):
 
 
 class TaskState(Message, frozen=True, kw_only=True):
-    """The task's own state (ink, phases), where it has changed."""
+    """Arrays of the task's own state (ink, phases) that have changed; the others stay as told before."""
 
     resets: int
     arrays: dict[str, tuple[str, tuple[int, ...], bytes]]  # dtype, shape, bytes

@@ -2,7 +2,7 @@
 
 `python -m studio.rendering TASK HEIGHT WIDTH` reads requests from standard input until it ends. Each is the
 head `REQUEST`, float64 positions and, where it has changed, the painted texture; the answer is, for each
-camera, the head `ANSWER`, a JPEG and the RGB pixels.
+camera, the head `ANSWER`, a JPEG and, where asked for, the RGB pixels.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import cv2
 import mujoco
 import numpy as np
 
-REQUEST = struct.Struct("<dII")  # time [s], bytes of positions, bytes of texture
-ANSWER = struct.Struct("<I")  # bytes of the JPEG
+REQUEST = struct.Struct("<II?")  # bytes of positions, bytes of texture, whether pixels are wanted
+ANSWER = struct.Struct("<II")  # bytes of the JPEG, bytes of the pixels
 READY = b"ready\n"
 JPEG_QUALITY = 90
 
@@ -38,7 +38,7 @@ def main(task_name: str, height: int, width: int) -> None:
         answers.write(READY)
         answers.flush()
         while len(head := requests.read(REQUEST.size)) == REQUEST.size:
-            data.time, n_positions, n_texture = REQUEST.unpack(head)
+            n_positions, n_texture, want_pixels = REQUEST.unpack(head)
             data.qpos[:] = np.frombuffer(requests.read(n_positions))
             if n_texture and painted:
                 _upload(renderer, model, painted[0], requests.read(n_texture))
@@ -49,7 +49,8 @@ def main(task_name: str, height: int, width: int) -> None:
                 renderer.update_scene(data, view.name)
                 pixels = renderer.render()
                 _, jpeg = cv2.imencode(".jpg", pixels[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
-                answers.write(ANSWER.pack(len(jpeg)) + jpeg.tobytes() + pixels.tobytes())
+                raw = pixels.tobytes() if want_pixels else b""
+                answers.write(ANSWER.pack(len(jpeg), len(raw)) + jpeg.tobytes() + raw)
             answers.flush()
 
 

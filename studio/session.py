@@ -9,7 +9,9 @@ the bit.
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 CONTROL_PERIOD = 0.01  # [s] of one tick
 IMAGE_EVERY = 5  # ticks between images and task states: 20 Hz
 SNAPSHOT_EVERY = 100  # ticks between full simulator states: 1 Hz
+KEPT_TICKS = 6000  # ticks that the clock remembers: a minute
 LATE = 0.002  # [s] a tick that starts later than this after its deadline counts as late
 
 
@@ -97,7 +100,7 @@ class Session:
         reason: Literal["finished", "time limit", "success"] = "time limit"
         try:
             for tick in range(round(time_limit / CONTROL_PERIOD)):
-                if not self.tick(tick, agent, subscribers):
+                if self.tick(agent, subscribers, tick if subscribers else None) is None:
                     reason = "finished"
                     break
                 if stop_on_success and self.robot.progress().success:
@@ -109,35 +112,40 @@ class Session:
             self.robot.hold()
         return Ending(reason, self.robot.progress(), self.robot.observe().time - start)
 
-    def tick(self, tick: int, agent: Agent, subscribers: Sequence[Subscriber] = ()) -> bool:
-        """One control period, the `tick`-th of a take; False where the agent is finished.
+    def tick(
+        self, agent: Agent, subscribers: Sequence[Subscriber] = (), take_tick: int | None = None
+    ) -> Step | None:
+        """One control period; None where the agent is finished.
 
-        Snapshots, task states and digests are only taken where someone listens.
+        `take_tick` counts the periods of a take from 0. Without one nobody keeps the step, and snapshots,
+        task states and digests are left out.
         """
         robot = self.robot
         observation = robot.observe()
         requested = agent.act(observation)
         if requested is None:
-            return False
-        if not subscribers:
-            robot.apply(requested)
-            return True
-        task_state = robot.task_state() if tick % IMAGE_EVERY == 0 else None
-        snapshot = robot.save() if tick % SNAPSHOT_EVERY == 0 else None
-        applied = robot.apply(requested)
-        step = Step(observation, requested, applied, robot.digest(), task_state, snapshot)
+            return None
+        if take_tick is None:
+            step = Step(observation, requested, robot.apply(requested), b"", None, None)
+        else:
+            task_state = robot.task_state() if take_tick % IMAGE_EVERY == 0 else None
+            snapshot = robot.save() if take_tick % SNAPSHOT_EVERY == 0 else None
+            applied = robot.apply(requested)
+            late = self.clock.delay if self.clock else 0.0
+            step = Step(observation, requested, applied, robot.digest(), task_state, snapshot, late)
         for subscriber in subscribers:
             subscriber.on_step(step)
-        return True
+        return step
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Pace:
-    """How well the loop kept time."""
+    """How well the loop kept time, over the ticks it was asked about."""
 
-    ticks: int = 0
-    late: int = 0
-    worst: float = 0.0  # [s] longest delay after a deadline
+    ticks: int
+    late: int
+    worst: float  # [s] longest delay after a deadline
+    rate: float  # [Hz]
 
     @property
     def late_share(self) -> float:
@@ -153,19 +161,33 @@ class Clock:
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.pace = Pace()
         self._period, self._now, self._sleep = period, now, sleep
         self._deadline = now()
+        self._met: deque[tuple[float, float]] = deque(maxlen=KEPT_TICKS)  # (when [s], delay [s])
+        self.delay = 0.0  # [s] with which the last deadline was met
 
     def wait(self) -> None:
-        """Sleep until the next deadline and count how late it was met."""
+        """Sleep until the next deadline and note how late it was met."""
         self._deadline += self._period
         ahead = self._deadline - self._now()
         if ahead > 0:
             self._sleep(ahead)
-        delay = self._now() - self._deadline
-        self.pace.ticks += 1
-        self.pace.worst = max(self.pace.worst, delay)
-        if delay > LATE:
-            self.pace.late += 1
-            self._deadline += delay
+        now = self._now()
+        self.delay = now - self._deadline
+        self._met.append((now, self.delay))
+        if self.delay > LATE:
+            self._deadline = now
+
+    def restart(self) -> None:
+        """Begin a new schedule now, after a pause that was meant."""
+        self._deadline = self._now()
+
+    def pace(self, seconds: float = math.inf) -> Pace:
+        """Over the last `seconds`, as far as they are remembered."""
+        since = self._now() - seconds
+        delays = [delay for when, delay in self._met if when >= since]
+        if not delays:
+            return Pace(0, 0, 0.0, 0.0)
+        span = self._met[-1][0] - max(self._met[0][0], since)
+        late = sum(delay > LATE for delay in delays)
+        return Pace(len(delays), late, max(delays), (len(delays) - 1) / span if span > 0 else 0.0)

@@ -71,7 +71,7 @@ class Twin:
         self.arms = tuple(_Arm(i, setup, self.world, self.config) for i, setup in enumerate(task.arms))
         self.seed = 0
         self.spread = 1.0
-        self._cameras = cameras
+        self.cameras = cameras
         self._fresh = False  # whether mj_step1 has run for the present state
         self._objects = [
             self.model.body(int(self.model.jnt_bodyid[j])).name
@@ -110,7 +110,7 @@ class Twin:
     def observe(self) -> Observation:
         self._refresh()
         arms = tuple(arm.observe(self.data.time) for arm in self.arms)
-        images = self._cameras.newest(self) if self._cameras else {}
+        images = self.cameras.newest(self) if self.cameras else {}
         return Observation(self.data.time, arms, images)
 
     def apply(self, action: Action) -> Applied:
@@ -127,7 +127,7 @@ class Twin:
                 arm.step(trace[index, k], self.data.time)
             mujoco.mj_step2(self.model, self.data)
             self._fresh = False
-        self._refresh()
+        # Before the next mj_step1 lays out new contacts: poses, contacts and forces of the last step agree.
         self.task.update(self.world)
         limits: tuple[Limit, ...] = tuple(limit for arm in self.arms for limit in arm.servo.limits)
         return Applied(applied, limits, trace)
@@ -135,6 +135,10 @@ class Twin:
     def hold(self) -> None:
         for arm in self.arms:
             arm.servo.hold()
+
+    def restart_time(self) -> None:
+        """Count time from here, as a take does. Nothing else depends on time."""
+        self.data.time = 0.0
 
     def progress(self) -> Progress:
         """How far the task is."""
@@ -148,7 +152,7 @@ class Twin:
         return {**self.task.state(), **poses}
 
     def save(self) -> Snapshot:
-        arrays = {"physics": self._physics(), **self.task.state()}
+        arrays = {"physics": self._physics(), "sensors": self.data.sensordata.copy(), **self.task.state()}
         for arm in self.arms:
             arrays[f"servo/{arm.setup.name}"] = arm.servo.state()
             arrays[f"tare/{arm.setup.name}"] = arm.tare_wrench.copy()
@@ -167,6 +171,7 @@ class Twin:
         mujoco.mj_setState(self.model, self.data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_forward(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
+        self.data.sensordata[:] = arrays["sensors"]  # forces are those of the step before, see `_Arm.measure`
         for arm in self.arms:
             arm.servo.restore(arrays[f"servo/{arm.setup.name}"])
             arm.tare_wrench = np.array(arrays[f"tare/{arm.setup.name}"])
@@ -239,7 +244,7 @@ class _Arm:
         self.droop = np.zeros(6)  # (6,) [rad] integral action
         self._wrench_flange = np.zeros(6)  # external, tared, flange axes
         self._wrench = np.zeros(6)  # external, tared, about the TCP, base axes
-        self._payload = _weight_of(setup.grasp)
+        self._payload = _weight_of_hand(model, name) + _weight_of(setup.grasp)
 
     def place(self, world_from_tcp: Pose) -> None:
         """Put the arm at rest with its TCP at a pose, and the part it holds into the open hand."""
@@ -317,9 +322,10 @@ class _Arm:
         self._wrench[3:] = tx + ay * fz - az * fy, ty + az * fx - ax * fz, tz + ax * fy - ay * fx
 
     def _external_wrench(self) -> Array:
-        """(6,) what the environment exerts on the hand, flange axes, without the held part's weight.
+        """(6,) what the environment exerts on the hand, flange axes, without the weight of hand and held part.
 
-        MuJoCo's sensor gives what the arm exerts on the hand. The hand itself is gravity-compensated.
+        MuJoCo's sensor gives what the arm exerts on the hand, its weight included, even though the joints
+        are spared that (`gravcomp`).
         """
         wrench: Array = -self._sensor - self._payload.dot(self._flange_matrix[6:])
         return wrench
@@ -329,13 +335,32 @@ class _Arm:
         return self.kinematics.inverse_kinematics(base_from_tcp, HOME_Q)
 
 
+def _weight(mass: float, center: Array) -> Array:
+    """(6, 3): the world's upward direction in flange axes to a mass's weight as a wrench there.
+
+    `center` (3,) [m] of the mass in the flange frame.
+    """
+    x, y, z = center.tolist()
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return -GRAVITY * mass * np.vstack((np.eye(3), cross))
+
+
+def _weight_of_hand(model: mujoco.MjModel, arm: str) -> Array:
+    """With the fingers open; closing them moves its centre of mass by millimetres."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    flange = model.body(f"{arm}_flange").id
+    world_from_flange = Pose(data.xpos[flange], data.xquat[flange])
+    return _weight(
+        float(model.body_subtreemass[flange]), world_from_flange.inverse().apply(data.subtree_com[flange])
+    )
+
+
 def _weight_of(grasp: Grasp | None) -> Array:
-    """(6, 3): the world's upward direction in flange axes to the held part's weight as a wrench there."""
     if grasp is None:
         return np.zeros((6, 3))
-    x, y, z = grasp.flange_from_body.apply(grasp.center).tolist()
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return -GRAVITY * grasp.mass * np.vstack((np.eye(3), cross))
+    return _weight(grasp.mass, grasp.flange_from_body.apply(grasp.center))
 
 
 def build_model(task: Task) -> mujoco.MjModel:

@@ -1,0 +1,548 @@
+"""The session process: one twin in real time, one recorder, commands in, reports out.
+
+`python -m studio.live --data DIR --task NAME` owns the robot for as long as it runs. Whoever drives, records
+or watches is a client on its socket (`studio.link`); a client that stalls, crashes or leaves never stops the
+loop. Without any client the arms hold, and after `ORPHAN_TIME` the take is kept and the process ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import gc
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import assert_never
+
+import numpy as np
+import tyro
+
+from controller.servo import ServoConfig
+from controller.stiffness import nearest_mode
+from controller.types import Limit, Pose, Step, StiffnessMode
+from studio import messages as m
+from studio import tasks
+from studio.cameras import LiveCameras
+from studio.episode import Outcome
+from studio.inputs.operator import OperatorAgent, step_of
+from studio.inputs.scripted import ScriptedAgent
+from studio.link import Hub, socket_path
+from studio.recorder import Recorder, Take
+from studio.session import CONTROL_PERIOD, Agent, Clock, Session, Subscriber
+from studio.station import header_of
+from studio.tasks import Progress
+from studio.twin import Twin
+
+FRAME_EVERY = 3  # ticks: 33 Hz
+STATUS_EVERY = 10  # ticks: 10 Hz
+TASK_STATE_EVERY = 10  # ticks: 10 Hz, where it has changed
+PACE_WINDOW = 10.0  # [s] over which rate and delays are reported
+SHOWN = 0.7  # [s] that a limit stays on display
+HELD_SUCCESS = 0.5  # [s] for which success must hold before collecting ends a take
+BETWEEN_TAKES = 1.5  # [s] that a kept take is shown before the next reset, while collecting
+ORPHAN_TIME = 60.0  # [s] without any client
+SWITCH_INTERVAL = 0.0005  # [s] after which another thread must hand the interpreter back to the loop
+
+log = logging.getLogger(__name__)
+
+
+class LiveSession:
+    """The loop and what it owns. `run` is its thread; everything else reaches it through the hub."""
+
+    def __init__(self, data_dir: Path, task: str, hub: Hub, *, seed: int = 0, cameras: bool = True) -> None:
+        self._hub = hub
+        self._recorder = Recorder(data_dir)
+        self._with_cameras = cameras
+        self._config = ServoConfig()
+        self._clock = Clock(CONTROL_PERIOD)
+        self._resets = 0  # how often a scene was put on the stage
+        self._robot: Twin
+        self._session: Session
+        self._cameras: LiveCameras | None = None
+        self._hands: OperatorAgent
+        self._agent: Agent
+        self._ended = False
+        self._driver: m.Driver = "nobody"
+        self._operator = ""
+        self._take: Take | None = None
+        self._take_ticks = 0
+        self._countdown: float | None = None  # [s] left, while counting down
+        self._last_take: m.TakeStatus | None = None
+        self._collection = Collection()
+        self._limits: dict[int, tuple[float, Limit]] = {}  # newest of each arm, and when [s]
+        self._told_state: dict[str, bytes] = {}
+        self._told_images: dict[str, float] = {}
+        self._ticks = 0
+        self._alone_since: float | None = None
+        self._success_since: float | None = None
+        self._load(task, seed, 1.0)
+
+    # The loop
+
+    def run(self) -> None:
+        """Until a `Shutdown`, or until everybody has left for long enough."""
+        clock = self._clock
+        clock.restart()
+        try:
+            while not self._ended:
+                for command in self._hub.commands.drain():
+                    self._obey(command)
+                self._look_around()
+                self._advance()
+                clock.wait()
+        finally:
+            self._robot.hold()
+            self._end_take(None, "the session ended")
+            self._close_cameras()
+
+    def _advance(self) -> None:
+        subscribers: list[Subscriber] = [self._take] if self._take else []
+        step = self._session.tick(self._agent, subscribers, self._take_ticks if self._take else None)
+        if step is None:  # the script is done
+            self._set_driver("nobody", self._operator)
+            if self._take:
+                self._end_take(None, "the script finished")
+            return
+        if self._take:
+            self._take_ticks += 1
+        self._ticks += 1
+        for limit in step.applied.limits:
+            self._limits[limit.arm] = (time.monotonic(), limit)
+        self._publish(step)
+
+    def _look_around(self) -> None:
+        """What happens by itself: countdowns, failing disks, collecting, being left alone."""
+        if self._countdown is not None:
+            self._count_down()
+        if self._take and self._take.error:
+            error = self._take.error
+            self._end_take(None, error)
+            self._tell("error", error)
+        if self._collection.is_running:
+            self._collect()
+        self._watch_for_clients()
+
+    def _watch_for_clients(self) -> None:
+        if self._hub.n_clients:
+            self._alone_since = None
+            return
+        now = time.monotonic()
+        if self._alone_since is None:
+            self._alone_since = now
+            if self._driver == "operator":  # nobody holds the other end of the arm
+                self._set_driver("nobody", self._operator)
+        elif now - self._alone_since > ORPHAN_TIME:
+            log.warning("No client for %.0f s; the session ends.", ORPHAN_TIME)
+            self._ended = True
+
+    # Commands
+
+    def _obey(self, command: m.Command) -> None:
+        try:
+            self._execute(command)
+        except (KeyError, ValueError, OSError) as error:
+            text = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+            log.warning("%s: %s", type(command).__name__, text)
+            self._tell("error", text)
+
+    def _execute(self, command: m.Command) -> None:
+        match command:
+            case m.MoveTo():
+                self._hands.move_to(command.arm, Pose(np.array(command.position), np.array(command.wxyz)))
+            case m.Nudge():
+                self._hands.nudge(command.arm, step_of(command.translation, command.rotation))
+            case m.Engage():
+                self._engage(command.arm, command.engaged)
+            case m.SetMode():
+                self._hands.set_mode(command.arm, StiffnessMode(command.mode))
+            case m.SetGripper():
+                self._hands.hands[command.arm].gripper = command.opening
+            case m.Release():
+                self._release()
+            case m.Drive():
+                self._set_driver(command.driver, command.operator)
+            case m.Reset():
+                self._reset(command)
+            case m.StartTake():
+                self._start_countdown(command.countdown, command.operator)
+            case m.EndTake():
+                self._stop(command.judgement)
+            case m.DiscardTake():
+                self._discard()
+            case m.Collect():
+                self._start_collecting(command)
+            case m.RestartCameras():
+                self._restart_cameras()
+            case m.Shutdown():
+                self._ended = True
+            case _:
+                assert_never(command)
+
+    def _engage(self, arm: int, engaged: bool) -> None:
+        hand = self._hands.hands[arm]
+        if not engaged:
+            hand.park()
+        elif self._driver == "operator":
+            hand.engage(self._robot.arms[arm].servo.target)
+        else:
+            raise ValueError("Choose the operator as driver first.")
+
+    def _release(self) -> None:
+        """Stop: every arm lets go of its press and waits to be engaged again."""
+        self._set_driver("operator" if self._driver == "operator" else "nobody", self._operator)
+        for hand in self._hands.hands:
+            hand.release()
+
+    def _set_driver(self, driver: m.Driver, operator: str) -> None:
+        self._driver, self._operator = driver, operator
+        for arm, hand in enumerate(self._hands.hands):
+            if driver == "operator":
+                hand.engage(self._robot.arms[arm].servo.target)
+            else:
+                hand.park()
+        if driver == "script":
+            self._agent = ScriptedAgent(self._robot, self._robot.seed)
+            self._agent.reset(self._robot.observe())
+        else:
+            self._agent = self._hands
+        if self._take:
+            self._take.add_event("driver", f"{driver} {operator}".strip())
+
+    def _reset(self, command: m.Reset) -> None:
+        if self._take:
+            raise ValueError("A take is being recorded; stop it before resetting.")
+        driver = self._driver if self._driver != "script" else "nobody"
+        self._countdown = None
+        self._load(command.task or self._robot.task.name, command.seed, command.spread)
+        self._set_driver(driver, self._operator)
+        self._clock.restart()
+
+    def _load(self, task: str, seed: int, spread: float) -> None:
+        """Put the scene of a task on the stage; builds a new twin only for another task."""
+        if self._resets == 0 or task != self._robot.task.name:
+            scene = tasks.load(task)  # refuses an unknown task before anything is given up
+            if self._resets:
+                self._close_cameras()
+            self._cameras = LiveCameras(task) if self._with_cameras else None
+            self._robot = Twin(scene, self._config, self._cameras)
+            self._session = Session(self._robot)
+            self._session.clock = self._clock
+        self._robot.reset(seed, spread)
+        if self._cameras:
+            self._cameras.clear()
+        self._hands = OperatorAgent(self._robot.task.arms, self._config.stiffness_table)
+        self._agent = self._hands
+        self._resets += 1
+        self._limits.clear()
+        self._told_state.clear()
+        self._success_since = None
+
+    # Takes
+
+    def _start_countdown(self, seconds: float, operator: str) -> None:
+        if self._take or self._countdown is not None:
+            raise ValueError("A take is running already.")
+        self._operator = operator or self._operator
+        self._countdown = max(0.0, seconds)
+        if seconds > 0:
+            self._tell("countdown", f"Recording in {seconds:.0f} s.")
+
+    def _count_down(self) -> None:
+        assert self._countdown is not None
+        self._countdown -= CONTROL_PERIOD
+        if self._countdown <= 0:
+            self._countdown = None
+            self._start_take()
+
+    def _start_take(self) -> None:
+        self._robot.restart_time()
+        try:
+            header = header_of(
+                self._robot,
+                agent={"operator": "gizmo", "script": "scripted", "nobody": "nobody"}[self._driver],
+                operator=self._operator or None,
+                has_images=self._cameras is not None and self._cameras.error is None,
+            )
+            self._take = self._recorder.start(header)
+        except OSError as error:
+            self._collection.stop()
+            self._tell("error", str(error))
+            return
+        self._take_ticks = 0
+        self._success_since = None
+        self._tell("recording", f"Recording {header.episode_id}.")
+
+    def _stop(self, judgement: m.Judgement | None) -> None:
+        if self._countdown is not None:
+            self._countdown = None
+            self._collection.stop()
+            return
+        if not self._take:
+            raise ValueError("No take is running.")
+        self._end_take(judgement, "stopped by the operator")
+
+    def _end_take(self, judgement: m.Judgement | None, reason: str) -> None:
+        """Keep the running take, if there is one."""
+        if self._take is None:
+            return
+        take, self._take = self._take, None
+        progress = self._robot.progress()
+        success = {"success": True, "failure": False, "unmarked": None, None: progress.success}[judgement]
+        path = take.finish(Outcome(success, f"{reason}: {progress.phase}", progress.value))
+        outcome: m.Judgement = "unmarked" if success is None else "success" if success else "failure"
+        self._last_take = m.TakeStatus(
+            episode_id=take.header.episode_id,
+            path=str(path),
+            seconds=self._take_ticks * CONTROL_PERIOD,
+            outcome=outcome,
+            discarded=False,
+        )
+        self._collection.kept(time.monotonic())
+        self._tell("take kept", f"Kept as {outcome}: {take.header.episode_id}.", self._last_take)
+
+    def _discard(self) -> None:
+        if self._take:
+            take, self._take = self._take, None
+            path = take.discard()
+            seconds = self._take_ticks * CONTROL_PERIOD
+            self._last_take = m.TakeStatus(take.header.episode_id, str(path), seconds, "unmarked", True)
+            self._tell("take discarded", f"In the trash: {take.header.episode_id}.", self._last_take)
+            self._collection.again(time.monotonic())
+        elif self._countdown is not None:
+            self._countdown = None
+        else:
+            raise ValueError("No take is running.")
+
+    def _start_collecting(self, command: m.Collect) -> None:
+        if command.count <= 0:
+            self._collection.stop()
+            return
+        if self._take:
+            raise ValueError("A take is being recorded; stop it first.")
+        self._operator = command.operator or self._operator
+        self._collection.start(command.count, command.seed, command.countdown)
+
+    def _collect(self) -> None:
+        """The next step of collecting: reset to the next seed, count down, end at success."""
+        now = time.monotonic()
+        if self._take:
+            if not self._robot.progress().success:
+                self._success_since = None
+            elif self._success_since is None:
+                self._success_since = now
+                self._tell("success", "Done.")
+            elif now - self._success_since >= HELD_SUCCESS and self._driver != "script":
+                self._end_take(None, "success")
+        elif self._countdown is None and self._collection.is_due(now):
+            driver = self._driver if self._driver != "nobody" else self._collection.driver
+            self._collection.driver = driver
+            self._reset(m.Reset(seed=self._collection.seed, spread=self._robot.spread))
+            self._start_countdown(self._collection.countdown, self._operator)
+            self._set_driver(driver, self._operator)
+
+    # Reports
+
+    def _publish(self, step: Step) -> None:
+        now = time.monotonic()
+        if self._ticks % FRAME_EVERY == 0:
+            self._hub.publish("frame", self._frame(step, now))
+        if self._ticks % STATUS_EVERY == 0:
+            self._hub.publish("status", self._status(now))
+        if self._ticks % TASK_STATE_EVERY == 0:
+            self._publish_task_state()
+        for name, image in step.observation.images.items():
+            if image.jpeg and self._told_images.get(name) != image.time:
+                self._told_images[name] = image.time
+                report = m.CameraImage(camera=name, time=image.time, resets=self._resets, jpeg=image.jpeg)
+                self._hub.publish(("image", name), report)
+
+    def _publish_task_state(self) -> None:
+        """Each array by itself, so that a counter that runs does not carry the whole board along."""
+        for name, array in self._robot.task.state().items():
+            data = array.tobytes()
+            if self._told_state.get(name) != data:
+                self._told_state[name] = data
+                self._hub.publish(("task state", name), m.TaskState.of({name: array}, self._resets))
+
+    def _frame(self, step: Step, now: float) -> m.Frame:
+        arms = []
+        for index, (state, arm) in enumerate(zip(step.observation.arms, self._robot.arms, strict=True)):
+            arms.append(
+                m.ArmFrame(
+                    base_from_tcp=tuple(state.base_from_tcp.vector.tolist()),
+                    base_from_target=tuple(arm.servo.target.vector.tolist()),
+                    wrench=tuple(state.wrench.vector.tolist()),
+                    stiffness=float(arm.servo.stiffness.translational.trace()) / 3,
+                    gripper=state.gripper,
+                    level=self._level(index, now)[0],
+                )
+            )
+        qpos = self._robot.data.qpos.tobytes()
+        return m.Frame(time=self._robot.data.time, resets=self._resets, qpos=qpos, arms=tuple(arms))
+
+    def _level(self, arm: int, now: float) -> tuple[m.Level, str]:
+        """How the arm's last targets fared, for as long as a person needs to read it."""
+        when, limit = self._limits.get(arm, (-1e9, None))
+        if limit is None or now - when > SHOWN:
+            return "ok", ""
+        return ("refused" if limit.refused else "limited"), limit.why
+
+    def _status(self, now: float) -> m.Status:
+        robot = self._robot
+        progress: Progress = robot.progress()
+        pace = self._clock.pace(PACE_WINDOW)
+        arms = []
+        for index, (setup, hand) in enumerate(zip(robot.task.arms, self._hands.hands, strict=True)):
+            level, why = self._level(index, now)
+            arms.append(
+                m.ArmStatus(
+                    name=setup.name,
+                    mode=self._mode_of(index).value,
+                    modes=(setup.modes[0].value, setup.modes[1].value),
+                    engaged=hand.engaged,
+                    level=level,
+                    why=why,
+                    input_age=self._hands.input_age(index),
+                )
+            )
+        return m.Status(
+            task=robot.task.name,
+            instruction=robot.task.instruction,
+            seed=robot.seed,
+            spread=robot.spread,
+            resets=self._resets,
+            driver=self._driver,
+            operator=self._operator,
+            phase="recording" if self._take else "countdown" if self._countdown is not None else "idle",
+            countdown=self._countdown or 0.0,
+            take_seconds=self._take_ticks * CONTROL_PERIOD if self._take else 0.0,
+            take_id=self._take.header.episode_id if self._take else "",
+            take_error=(self._take.error or "") if self._take else "",
+            last_take=self._last_take,
+            collected=self._collection.done,
+            to_collect=self._collection.count,
+            progress=progress.value,
+            success=progress.success,
+            task_phase=progress.phase,
+            arms=tuple(arms),
+            rate=pace.rate,
+            late_share=pace.late_share,
+            worst_delay=pace.worst,
+            camera_error=(self._cameras.error or "") if self._cameras else "Cameras are switched off.",
+        )
+
+    def _mode_of(self, arm: int) -> StiffnessMode:
+        """The mode in force where someone else than the operator drives, else the operator's choice."""
+        if self._driver != "script":
+            return self._hands.hands[arm].mode
+        return nearest_mode(self._robot.arms[arm].servo.stiffness, self._config.stiffness_table)
+
+    def _tell(self, kind: m.NoticeKind, text: str, take: m.TakeStatus | None = None) -> None:
+        self._hub.tell(m.Notice(kind=kind, text=text, take=take))
+
+    # Cameras
+
+    def _restart_cameras(self) -> None:
+        self._close_cameras()
+        self._cameras = LiveCameras(self._robot.task.name) if self._with_cameras else None
+        self._robot.cameras = self._cameras
+
+    def _close_cameras(self) -> None:
+        if self._cameras:
+            self._cameras.close()
+
+
+@dataclass(slots=True)
+class Collection:
+    """How far collecting is: which seed comes next, and when."""
+
+    count: int = 0  # takes to keep; 0 while not collecting
+    done: int = 0
+    seed: int = 0  # of the next take
+    countdown: float = 3.0  # [s]
+    driver: m.Driver = "operator"
+    _due: float = 0.0  # [s] monotonic time of the next reset
+
+    @property
+    def is_running(self) -> bool:
+        return self.count > 0
+
+    def start(self, count: int, seed: int, countdown: float) -> None:
+        self.count, self.done, self.seed, self.countdown, self._due = count, 0, seed, countdown, 0.0
+
+    def stop(self) -> None:
+        self.count = 0
+
+    def kept(self, now: float) -> None:
+        """A take was kept: on to the next seed, or done."""
+        if not self.is_running:
+            return
+        self.done += 1
+        self.seed += 1
+        self._due = now + BETWEEN_TAKES
+        if self.done >= self.count:
+            self.stop()
+
+    def again(self, now: float) -> None:
+        """A take was discarded: the same seed once more."""
+        self._due = now + BETWEEN_TAKES
+
+    def is_due(self, now: float) -> bool:
+        return now >= self._due
+
+
+class SessionRunning(RuntimeError):
+    """Another session process owns this data folder."""
+
+
+@contextlib.contextmanager
+def _ownership(path: Path) -> Iterator[None]:
+    """Be the only session of a socket path; a lock that dies with its process."""
+    with path.with_suffix(".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise SessionRunning(f"A session process listens at {path} already.") from None
+        yield
+
+
+def main(data: Path, task: str = "wiping", seed: int = 0, cameras: bool = True) -> None:
+    """Run the session process of a data folder.
+
+    Args:
+        data: The data folder.
+        task: What is on the stage first.
+        seed: Of the first scene.
+        cameras: Render images.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    path = socket_path(data)
+    with _ownership(path):
+        hub = Hub(path)
+        try:
+            session = LiveSession(data.absolute(), task, hub, seed=seed, cameras=cameras)
+            _end_on_signal(lambda: hub.commands.post(m.Shutdown()))
+            with contextlib.suppress(PermissionError):
+                os.nice(-5)  # before cameras, page and jobs, where the user may
+            gc.collect()
+            gc.freeze()
+            session.run()
+        finally:
+            hub.close()
+            path.unlink(missing_ok=True)
+
+
+def _end_on_signal(end: Callable[[], None]) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: end())
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
