@@ -382,6 +382,10 @@ class Episode:
         """(time [s], arrays) at 20 Hz: the state at the start of a tick."""
         return map(schema.decode_arrays, self._mcap.messages("/task_state"))
 
+    def task_state_times(self) -> Array:
+        """(n,) [s] time of each of `task_states`, to the nanosecond."""
+        return self._times("/task_state")
+
     def task_state_at(self, time: float) -> dict[str, Array]:
         """The newest at or before `time` [s] (else the first); empty where the take has none."""
         number = self._number_at("/task_state", time)
@@ -404,7 +408,7 @@ class Episode:
 
     def image_times(self, camera: str) -> Array:
         """(n,) [s] time of the state that each image shows, to the nanosecond."""
-        return (self._mcap.log_times(self._camera_topic(camera)) - _log_zero(self.header.started)) * 1e-9
+        return self._times(self._camera_topic(camera))
 
     def image_ticks(self, camera: str) -> Array:
         """(n,) the tick whose observation each image shows: the newest at or before the image's time."""
@@ -444,6 +448,11 @@ class Episode:
 
     def _parsed(self, topic: str, name: str) -> Iterator[Any]:
         return map(schema.message(f"studio.v1.{name}").FromString, self._mcap.messages(topic))
+
+    def _times(self, topic: str) -> Array:
+        """(n,) [s] since reset of the messages of a topic."""
+        times: Array = (self._mcap.log_times(topic) - _log_zero(self.header.started)) * 1e-9
+        return times
 
     def _number_at(self, topic: str, time: float) -> int | None:
         """Of the newest message at or before `time` [s], else of the first."""
