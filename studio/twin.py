@@ -201,7 +201,10 @@ class Twin:
             self._fresh = True
 
     def _idle(self, seconds: float) -> None:
+        """Let the arms stay where they are put, until hands have closed and droops are made up for."""
         for _ in range(round(seconds / self.config.fast_period)):
+            for arm in self.arms:
+                arm.stay()
             mujoco.mj_step(self.model, self.data)
 
 
@@ -278,12 +281,17 @@ class _Arm:
     def step(self, row: Array, time: float) -> None:
         """Fill one trace row with the present state and command the next physics step."""
         self._fill(row, time)
-        q = self.servo.step(self._q, self._wrench_flange)
-        lead = self._lead * self.servo.dq_command
-        droop = self.droop + self._droop_gain * (q - self._q + lead - self._lag * self._dq)
-        self.droop = np.minimum(np.maximum(droop, -MAX_DROOP), MAX_DROOP)
-        self._ctrl[:] = q + lead + self.droop
+        self.servo.step(self._q, self._wrench_flange)
+        self.stay()
         self._hand[0] = models.GRIPPER_RANGE * (1.0 - self.servo.gripper)
+
+    def stay(self) -> None:
+        """Drive the joint servos to the joint command, with feed-forward and integral action."""
+        lead = self._lead * self.servo.dq_command
+        deflection = self.servo.q_command - self._q + lead - self._lag * self._dq
+        droop = self.droop + self._droop_gain * deflection
+        self.droop = np.minimum(np.maximum(droop, -MAX_DROOP), MAX_DROOP)
+        self._ctrl[:] = self.servo.q_command + lead + self.droop
 
     def observe(self, time: float) -> ArmState:
         row = np.empty(ARM_ROW_WIDTH)
