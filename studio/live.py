@@ -30,7 +30,7 @@ from studio import messages as m
 from studio import tasks
 from studio.cameras import LiveCameras
 from studio.episode import Outcome
-from studio.inputs.operator import OperatorAgent, step_of
+from studio.inputs.operator import HandOfOperator, OperatorAgent, step_of
 from studio.inputs.scripted import ScriptedAgent
 from studio.link import Hub, socket_path
 from studio.recorder import Recorder, Take
@@ -150,19 +150,22 @@ class LiveSession:
             text = str(error.args[0]) if isinstance(error, KeyError) else str(error)
             log.warning("%s: %s", type(command).__name__, text)
             self._tell("error", text)
+        except Exception as error:  # our own mistake must not take the robot down
+            log.exception("%s failed", type(command).__name__)
+            self._tell("error", f"{type(command).__name__} failed: {error!r}")
 
     def _execute(self, command: m.Command) -> None:
         match command:
             case m.MoveTo():
-                self._hands.move_to(command.arm, Pose(np.array(command.position), np.array(command.wxyz)))
+                self._hand(command.arm).move_to(Pose(np.array(command.position), np.array(command.wxyz)))
             case m.Nudge():
-                self._hands.nudge(command.arm, step_of(command.translation, command.rotation))
+                self._hand(command.arm).nudge(step_of(command.translation, command.rotation))
             case m.Engage():
                 self._engage(command.arm, command.engaged)
             case m.SetMode():
-                self._hands.set_mode(command.arm, StiffnessMode(command.mode))
+                self._hand(command.arm).mode = StiffnessMode(command.mode)
             case m.SetGripper():
-                self._hands.hands[command.arm].gripper = command.opening
+                self._hand(command.arm).gripper = command.opening
             case m.Release():
                 self._release()
             case m.Drive():
@@ -184,8 +187,13 @@ class LiveSession:
             case _:
                 assert_never(command)
 
+    def _hand(self, arm: int) -> HandOfOperator:
+        if not 0 <= arm < len(self._hands.hands):
+            raise ValueError(f"No arm {arm}; this task has {len(self._hands.hands)}, counted from 0.")
+        return self._hands.hands[arm]
+
     def _engage(self, arm: int, engaged: bool) -> None:
-        hand = self._hands.hands[arm]
+        hand = self._hand(arm)
         if not engaged:
             hand.park()
         elif self._driver == "operator":
@@ -408,7 +416,7 @@ class LiveSession:
                     engaged=hand.engaged,
                     level=level,
                     why=why,
-                    input_age=self._hands.input_age(index),
+                    input_age=hand.input_age,
                 )
             )
         return m.Status(

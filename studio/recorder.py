@@ -22,6 +22,7 @@ import threading
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 
@@ -204,10 +205,11 @@ class Take:
 
 
 def new_episode_id(task: str) -> str:
-    """Sorts by time (UTC, to the microsecond), and is unique across processes and machines."""
-    return f"{datetime.now(UTC):%Y%m%d-%H%M%S-%f}-{task}-{secrets.token_hex(3)}"
+    """Sorts by time (UTC, to the second), and is unique across processes and machines."""
+    return f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{task}-{secrets.token_hex(3)}"
 
 
+@cache
 def versions() -> dict[str, str]:
     """Of what decides whether a replay gives the same bits, for `Header.versions`."""
     packages = {"studio": "compact-studio", "mujoco": "mujoco", "numpy": "numpy", "pin": "pin"}

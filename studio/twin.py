@@ -7,6 +7,7 @@ MuJoCo's integration state, the servos, the task's own state and the F/T tare.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -34,12 +35,12 @@ from controller.types import (
 from studio import models
 from studio.tasks import ArmSetup, CameraView, Grasp, Progress, Task, World
 
-# Share of the servo's velocity lag (kv / kp) that is fed forward. All of it makes free space unstable with
-# the hand's inertia behind the F/T sensor; half of it doubles the stability margin in contact.
-VELOCITY_FEEDFORWARD = 0.5
+# Share of the servo's velocity lag (kv / kp) that is fed forward. With none of it, or with half, presses
+# chatter from FDCC's error_scale 0.4 on; with 0.3 they are quiet up to 0.7 (docs/contact.md).
+VELOCITY_FEEDFORWARD = 0.3
 
 # Integral action of the joint servos, as industrial arms have it: a droop under load is made up for within
-# this time [s]. Without it the TCP yields by 4 % of the press at 750 N/m; much faster, contact chatters.
+# this time [s]. Without it the TCP yields by 4 % of the press at 750 N/m.
 DROOP_TIME = 0.2
 MAX_DROOP = 0.02  # [rad] most that is made up for
 
@@ -48,7 +49,7 @@ GRAVITY = 9.81  # [m/s²]
 GRASP_CLOSING = 0.6  # [s] simulated at reset, with the part fixed to the flange
 GRASP_SETTLING = 0.4  # [s] simulated at reset, with the part held by friction alone
 
-HOME_Q = np.array([0.0, -1.2, 1.9, -2.27, -1.57, 0.0])  # [rad] start of the search for home, elbow up
+HOME_Q = np.array([0.0, -1.2, 1.9, -2.27, -1.57, 0.0])  # [rad] elbow up, tool down, hand in front (+x)
 
 
 class Cameras(Protocol):
@@ -217,8 +218,8 @@ class _Arm:
         self.kinematics: ArmModel = ur5e(setup.flange_from_tcp)
         low, high = (corner - setup.base_position for corner in setup.workspace)
         self._medium = stiffness_of(StiffnessMode.MEDIUM, config.stiffness_table)
-        home = self._solve(setup.world_from_home)
-        self.servo = ArmServo(index, self.kinematics, config, (low, high), home, self._medium)
+        self._home = self._solve(setup.world_from_home, _towards(setup))
+        self.servo = ArmServo(index, self.kinematics, config, (low, high), self._home, self._medium)
         self.tare_wrench = np.zeros(6)  # (6,) [N, N·m] sensor reading at rest, flange axes
 
         name = setup.name
@@ -251,7 +252,7 @@ class _Arm:
 
     def place(self, world_from_tcp: Pose) -> None:
         """Put the arm at rest with its TCP at a pose, and the part it holds into the open hand."""
-        q = self._solve(world_from_tcp)
+        q = self._solve(world_from_tcp, self._home)
         gripper = 0.0 if self.setup.grasp else self.setup.gripper
         self.servo.reset(q, self._medium, gripper)
         self.droop[:] = 0.0
@@ -330,17 +331,26 @@ class _Arm:
         self._wrench[3:] = tx + ay * fz - az * fy, ty + az * fx - ax * fz, tz + ax * fy - ay * fx
 
     def _external_wrench(self) -> Array:
-        """(6,) what the environment exerts on the hand, flange axes, without the weight of hand and held part.
+        """(6,) what the environment exerts on hand and held part, their weight apart, in flange axes.
 
-        MuJoCo's sensor gives what the arm exerts on the hand, its weight included, even though the joints
-        are spared that (`gravcomp`).
+        MuJoCo's sensor gives what the arm exerts on the hand, its weight included, although the joints are
+        spared that (`gravcomp`).
         """
         wrench: Array = -self._sensor - self._payload.dot(self._flange_matrix[6:])
         return wrench
 
-    def _solve(self, world_from_tcp: Pose) -> Array:
+    def _solve(self, world_from_tcp: Pose, q_start: Array) -> Array:
         base_from_tcp = Pose(world_from_tcp.position - self.setup.base_position, world_from_tcp.wxyz)
-        return self.kinematics.inverse_kinematics(base_from_tcp, HOME_Q)
+        return self.kinematics.inverse_kinematics(base_from_tcp, q_start)
+
+
+def _towards(setup: ArmSetup) -> Array:
+    """Joints (6,) from which the search for home starts: the arm turned towards where its hand will be."""
+    world_from_flange = setup.world_from_home @ setup.flange_from_tcp.inverse()
+    x, y, _ = world_from_flange.position - setup.base_position
+    start = HOME_Q.copy()
+    start[0] += math.atan2(y, x)
+    return start
 
 
 def _weight(mass: float, center: Array) -> Array:

@@ -33,7 +33,7 @@ def target_of(agent: OperatorAgent) -> object:
 
 
 def test_a_hand_that_was_never_engaged_holds(operator: OperatorAgent) -> None:
-    operator.move_to(0, POSE)
+    operator.hands[0].move_to(POSE)
     assert isinstance(target_of(operator), Hold)
 
 
@@ -51,7 +51,7 @@ def test_a_still_hand_keeps_its_target(operator: OperatorAgent) -> None:
 
 def test_a_nudge_moves_in_base_axes_and_turns_in_tool_axes(operator: OperatorAgent) -> None:
     operator.hands[0].engage(POSE)
-    operator.nudge(0, step_of((0.0, 0.0, -0.01), (0.0, 0.0, 0.1)))
+    operator.hands[0].nudge(step_of((0.0, 0.0, -0.01), (0.0, 0.0, 0.1)))
     moved = target_of(operator).base_from_target  # type: ignore[attr-defined]
     assert moved.position == pytest.approx([0.4, 0.0, 0.19])
     # Tool z points down (-z): a turn about it lowers the yaw in base axes.
@@ -61,7 +61,7 @@ def test_a_nudge_moves_in_base_axes_and_turns_in_tool_axes(operator: OperatorAge
 
 def test_modes_switch_the_stiffness_and_nothing_else(operator: OperatorAgent) -> None:
     operator.hands[0].engage(POSE)
-    operator.set_mode(0, StiffnessMode.LOW)
+    operator.hands[0].mode = StiffnessMode.LOW
     target = target_of(operator)
     assert isinstance(target, CartesianTarget)
     assert target.stiffness.translational[2, 2] == 250.0
@@ -71,7 +71,7 @@ def test_modes_switch_the_stiffness_and_nothing_else(operator: OperatorAgent) ->
 def test_release_lasts_until_engaged_again(operator: OperatorAgent) -> None:
     operator.hands[0].engage(POSE)
     operator.hands[0].release()
-    operator.move_to(0, POSE)
+    operator.hands[0].move_to(POSE)
     assert isinstance(target_of(operator), Release)
     operator.hands[0].engage(POSE)
     assert isinstance(target_of(operator), CartesianTarget)

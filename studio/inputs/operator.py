@@ -16,55 +16,59 @@ from controller.types import (
     Observation,
     Pose,
     Release,
-    StiffnessMode,
     Target,
     multiply_quaternions,
     quaternion_from_rotation_vector,
 )
 from studio.tasks import ArmSetup
 
-CLOSED_AT_START = 0.0  # gripper command of an arm that holds a part from the start
-
 
 class HandOfOperator:
     """What the operator wants of one arm. A still hand keeps its target; a parked one holds."""
 
-    def __init__(self, setup: ArmSetup) -> None:
-        self.setup = setup
+    def __init__(self, setup: ArmSetup, now: Callable[[], float]) -> None:
         self.mode = setup.modes[0]
-        self.gripper = CLOSED_AT_START if setup.grasp else setup.gripper
-        self.engaged = False
-        self.moved_at: float | None = None  # [s] monotonic time of the newest target
-        self._target: Pose | None = None  # base_from_target; None until the first
+        self.gripper = 0.0 if setup.grasp else setup.gripper
+        self._target: Pose | None = None  # base_from_target; None while parked
         self._released = False
+        self._moved_at: float | None = None
+        self._now = now
+
+    @property
+    def engaged(self) -> bool:
+        """Whether the arm follows this hand."""
+        return self._target is not None
+
+    @property
+    def input_age(self) -> float | None:
+        """[s] since the operator last moved this hand; None before the first time."""
+        return None if self._moved_at is None else self._now() - self._moved_at
 
     def engage(self, base_from_target: Pose) -> None:
         """Take over from where the servo's target is: nothing moves."""
-        self._target = base_from_target
-        self.engaged = True
-        self._released = False
+        self._target, self._released = base_from_target, False
 
     def park(self) -> None:
-        self.engaged = False
+        """Leave the arm where it is."""
         self._target = None
 
     def release(self) -> None:
         """Stop pressing; the hand must be engaged anew."""
-        self.park()
-        self._released = True
+        self._target, self._released = None, True
 
-    def move_to(self, base_from_target: Pose, now: float) -> None:
+    def move_to(self, base_from_target: Pose) -> None:
+        """Set the target, unless parked."""
         if self.engaged:
-            self._target, self.moved_at = base_from_target, now
+            self._target, self._moved_at = base_from_target, self._now()
 
-    def nudge(self, translation: Pose, now: float) -> None:
-        """A step: `translation.position` in base axes, its rotation in tool axes."""
-        if self.engaged and self._target is not None:
-            target = self._target
-            wxyz = multiply_quaternions(target.wxyz, translation.wxyz)
-            self.move_to(Pose(target.position + translation.position, wxyz / (wxyz @ wxyz) ** 0.5), now)
+    def nudge(self, step: Pose) -> None:
+        """Move the target by a step: its position in base axes, its rotation in tool axes."""
+        if self._target is not None:
+            wxyz = multiply_quaternions(self._target.wxyz, step.wxyz)
+            self.move_to(Pose(self._target.position + step.position, wxyz / np.linalg.norm(wxyz)))
 
     def action(self, table: StiffnessTable) -> ArmAction:
+        """What to request now."""
         target: Target
         if self._target is not None:
             target = CartesianTarget(self._target, stiffness_of(self.mode, table))
@@ -82,29 +86,14 @@ class OperatorAgent:
         table: StiffnessTable = "tuned",
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.hands = tuple(HandOfOperator(setup) for setup in setups)
+        self.hands = tuple(HandOfOperator(setup, now) for setup in setups)
         self._table: StiffnessTable = table
-        self._now = now
 
     def reset(self, observation: Observation) -> None:
         """Nothing: hands keep what they want."""
 
     def act(self, observation: Observation) -> Action:
         return Action(tuple(hand.action(self._table) for hand in self.hands))
-
-    def move_to(self, arm: int, base_from_target: Pose) -> None:
-        self.hands[arm].move_to(base_from_target, self._now())
-
-    def nudge(self, arm: int, step: Pose) -> None:
-        self.hands[arm].nudge(step, self._now())
-
-    def set_mode(self, arm: int, mode: StiffnessMode) -> None:
-        self.hands[arm].mode = mode
-
-    def input_age(self, arm: int) -> float | None:
-        """[s] since the operator last moved this hand."""
-        moved_at = self.hands[arm].moved_at
-        return None if moved_at is None else self._now() - moved_at
 
 
 def step_of(translation: tuple[float, float, float], rotation: tuple[float, float, float]) -> Pose:
