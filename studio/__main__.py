@@ -1,0 +1,378 @@
+"""The command line: `studio …`. Each command is a thin skin of `studio.api`.
+
+Exit status: 0 done, 1 a check or a task failed, 2 wrong use. With `--json` the last output is one JSON value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+Data = Annotated[Path, arg(metavar="DIR", help="The data folder.")]
+Json = Annotated[bool, arg(name="json", help="Print one JSON value instead of text.")]
+EpisodeId = Annotated[str, arg(metavar="ID", help="An episode; see `studio episodes`.")]
+TaskName = Annotated[str, arg(metavar="TASK", help="A task; see `studio tasks`.")]
+
+DATA = Path("data")
+console = Console()
+
+
+def show_tasks(json: Json = False) -> int:
+    """List the tasks."""
+    from studio import tasks
+
+    found = [tasks.load(name) for name in tasks.names()]
+    if json:
+        _print_json(
+            [
+                {
+                    "task": task.name,
+                    "instruction": task.instruction,
+                    "arms": {arm.name: [mode.value for mode in arm.modes] for arm in task.arms},
+                    "cameras": [view.name for view in task.cameras],
+                    "time_limit_s": task.time_limit,
+                }
+                for task in found
+            ]
+        )
+        return 0
+    table = _table("task", "arms", "stiffness", "cameras", "instruction")
+    for task in found:
+        modes = ", ".join(
+            f"{arm.name[0].upper()} {'/'.join(m.value for m in arm.modes)}" for arm in task.arms
+        )
+        cameras = ", ".join(view.name for view in task.cameras)
+        table.add_row(task.name, str(len(task.arms)), modes, cameras, task.instruction)
+    console.print(table)
+    return 0
+
+
+def doctor(json: Json = False) -> int:
+    """Say what is missing on this machine, and what installs it."""
+    from studio.doctor import as_json, as_text, diagnose
+
+    findings = diagnose()
+    print(as_json(findings) if json else as_text(findings))
+    return 0
+
+
+def demo(
+    task: Positional[TaskName],
+    episodes: int = 1,
+    seed: int = 0,
+    data: Data = DATA,
+    workers: int = 1,
+    cameras: bool = True,
+    spread: float = 1.0,
+    json: Json = False,
+) -> int:
+    """Record scripted demonstrations, headless.
+
+    Args:
+        episodes: How many; their seeds are seed, seed + 1, …
+        seed: Of the first episode.
+        workers: Processes that record side by side.
+        cameras: Record images, too.
+        spread: Above 1 widens the task's randomisation.
+    """
+    from studio.api import Studio
+
+    with Studio(data) as studio, _progress(f"{task}", episodes, quiet=json) as advance:
+        report = studio.demo(
+            task,
+            episodes,
+            seed,
+            cameras=cameras,
+            workers=workers,
+            spread=spread,
+            on_take=lambda take: advance(),
+        )
+    if json:
+        _print_json(dataclasses.asdict(report))
+    else:
+        console.print(
+            f"{report.successes} of {report.episodes} succeeded, contact force {report.mean_force_N:.1f} N "
+            f"on average and {report.max_force_N:.1f} N at most, in {data}."
+        )
+        for failure in report.failures:
+            console.print(f"  no success: {failure['id']} (seed {failure['seed']}, {failure['phase']})")
+        if report.images not in ("yes", "no"):
+            console.print(f"  {report.images}", style="yellow", markup=False)
+    return 0
+
+
+def episodes(
+    task: str | None = None,
+    operator: str | None = None,
+    agent: str | None = None,
+    outcome: Literal["success", "failure", "unmarked"] | None = None,
+    min_quality: int | None = None,
+    flags: tuple[str, ...] = (),
+    seed: int | None = None,
+    text: str | None = None,
+    trash: bool = False,
+    data: Data = DATA,
+    json: Json = False,
+) -> int:
+    """List episodes, newest first.
+
+    Args:
+        text: Words in id, note, instruction or people.
+        flags: All of these must be set.
+        trash: List deleted episodes instead.
+    """
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        if trash:
+            studio.catalog.refresh()
+            rows = studio.catalog.trash()
+        else:
+            rows = studio.episodes(
+                task=task,
+                operator=operator,
+                agent=agent,
+                outcome=outcome,
+                min_quality=min_quality,
+                flags=flags or None,
+                seed=seed,
+                text=text,
+            )
+        unreadable = studio.catalog.unreadable()
+    if json:
+        _print_json(rows)
+        return 0
+    table = _table("id", "outcome", "s", "N mean", "N peak", "quality", "flags", "operator", "recorded")
+    for row in rows:
+        table.add_row(
+            row.episode_id,
+            row.outcome,
+            f"{row.duration:.1f}",
+            f"{row.mean_force:.1f}",
+            f"{row.peak_force:.1f}",
+            "" if row.quality is None else str(row.quality),
+            ", ".join(row.flags),
+            row.operator,
+            f"{datetime.fromtimestamp(row.started):%Y-%m-%d %H:%M}",
+        )
+    console.print(table if rows else f"No episodes in {data}. Record some: studio demo wiping --episodes 3")
+    for path, why in unreadable.items():
+        console.print(f"Unreadable: {path.name}: {why}", style="yellow", markup=False)
+    return 0
+
+
+def show(episode_id: Positional[EpisodeId], data: Data = DATA, json: Json = False) -> int:
+    """Show everything that is known of one episode."""
+    from studio import edits
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        row = studio.catalog.get(episode_id)
+        said = edits.read(edits.edits_path(row.path))
+        with studio.open(episode_id) as episode:
+            facts = {
+                **dataclasses.asdict(row),
+                "segments": [dataclasses.asdict(segment) for segment in said.segments],
+                "header": {
+                    field.name: getattr(episode.header, field.name)
+                    for field in dataclasses.fields(episode.header)
+                },
+                "reason": episode.outcome.reason,
+                "events": [dataclasses.asdict(event) for event in episode.events()],
+                "ticks_with_limits": len(episode.limits()),
+                "images": {camera: len(episode.image_times(camera)) for camera in episode.cameras},
+            }
+    if json:
+        _print_json(facts)
+    else:
+        console.print_json(_encode(facts))
+    return 0
+
+
+def annotate(
+    episode_id: Positional[EpisodeId],
+    outcome: Literal["success", "failure", "unmarked"] | None = None,
+    quality: int | None = None,
+    note: str | None = None,
+    add_flags: tuple[str, ...] = (),
+    remove_flags: tuple[str, ...] = (),
+    trim: tuple[float, float] | None = None,
+    author: str | None = None,
+    data: Data = DATA,
+    json: Json = False,
+) -> int:
+    """Say something about an episode; what was said before is kept.
+
+    Args:
+        quality: 1 poor .. 5 excellent.
+        trim: In and out point in seconds; the recording is not cut.
+        author: Who says so; your user name if not given.
+    """
+    from studio.api import Studio
+
+    changes: dict[str, Any] = {"outcome": outcome, "quality": quality, "note": note, "trim": trim}
+    changes |= {"add_flags": add_flags, "remove_flags": remove_flags}
+    with Studio(data) as studio:
+        row = studio.annotate(
+            episode_id, author=author, **{name: v for name, v in changes.items() if v not in (None, ())}
+        )
+    _print_json(row) if json else console.print(f"{row.episode_id}: {row.outcome}, quality {row.quality}")
+    return 0
+
+
+def delete(episode_id: Positional[EpisodeId], data: Data = DATA) -> int:
+    """Move an episode to the trash; `studio restore` brings it back."""
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        studio.delete(episode_id)
+    console.print(f"{episode_id} is in the trash; `studio restore {episode_id}` brings it back.")
+    return 0
+
+
+def restore(episode_id: Positional[EpisodeId], data: Data = DATA) -> int:
+    """Bring an episode back from the trash."""
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        row = studio.restore(episode_id)
+    console.print(f"{episode_id} is back at {row.path}.", soft_wrap=True)
+    return 0
+
+
+def recover(data: Data = DATA, json: Json = False) -> int:
+    """Finish recordings that a crash cut off; those still being recorded are left alone."""
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        found = studio.recover()
+    if json:
+        _print_json(found)
+    else:
+        for recovery in found:
+            console.print(recovery.what, markup=False)
+        if not found:
+            console.print("Nothing to recover.")
+    return int(any(recovery.state == "failed" for recovery in found))
+
+
+def replay(
+    episode_id: Positional[EpisodeId], check: bool = False, data: Data = DATA, json: Json = False
+) -> int:
+    """Simulate an episode again from its requested actions and compare every tick.
+
+    Args:
+        check: Exit with 1 where a state or an applied action differs, unless the take was recorded with
+            another version or on another machine.
+    """
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        result = studio.replay(episode_id)
+    if json:
+        _print_json({**dataclasses.asdict(result), "is_exact": result.is_exact})
+    else:
+        console.print(str(result), markup=False, soft_wrap=True)
+    return int(check and not result.is_exact and not result.other_versions)
+
+
+def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
+    """Measure speed and contact on this machine: medians, with the load average beside them.
+
+    Args:
+        only: Run only these parts.
+    """
+    from studio.benchmarks import run
+
+    results = run(only, tell=None if json else lambda name: console.print(f"… {name}", style="dim"))
+    _print_json(results) if json else console.print_json(_encode(results))
+    return 0
+
+
+COMMANDS: dict[str, Callable[..., int]] = {
+    "tasks": show_tasks,
+    "doctor": doctor,
+    "demo": demo,
+    "episodes": episodes,
+    "show": show,
+    "annotate": annotate,
+    "delete": delete,
+    "restore": restore,
+    "recover": recover,
+    "replay": replay,
+    "bench": bench,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit."""
+    status: int = 2
+    try:
+        status = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="studio", args=arguments)
+    except KeyboardInterrupt:
+        _complain("Interrupted.")
+        status = 130
+    except (KeyError, ValueError) as error:
+        _complain(error.args[0] if error.args else repr(error))
+    except (OSError, RuntimeError) as error:
+        _complain(str(error))
+        status = 1
+    sys.exit(status)
+
+
+def _complain(text: object) -> None:
+    Console(stderr=True).print(f"studio: {text}", style="red", markup=False, soft_wrap=True)
+
+
+def _print_json(value: Any) -> None:
+    print(_encode(value))
+
+
+def _encode(value: Any) -> str:
+    return json.dumps(_plain(value), ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: dataclasses as objects, paths as text, NaN as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for column in columns:
+        table.add_column(column, overflow="fold", justify="right" if column[0] in "sN" else "left")
+    return table
+
+
+@contextmanager
+def _progress(what: str, total: int, quiet: bool) -> Iterator[Callable[[], None]]:
+    """A progress bar on standard error; call what it yields once for each thing done."""
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda: bar.advance(task)
+
+
+if __name__ == "__main__":
+    main()
