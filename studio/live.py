@@ -16,7 +16,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import assert_never
 
@@ -29,14 +28,14 @@ from controller.types import Limit, Pose, Step, StiffnessMode
 from studio import messages as m
 from studio import tasks
 from studio.cameras import LiveCameras
-from studio.episode import Outcome
+from studio.episode import Header
 from studio.inputs.operator import HandOfOperator, OperatorAgent, step_of
 from studio.inputs.scripted import ScriptedAgent
 from studio.link import Hub, socket_path
-from studio.recorder import Recorder, Take
-from studio.session import CONTROL_PERIOD, Agent, Clock, Session, Subscriber
+from studio.recorder import Recorder
+from studio.session import CONTROL_PERIOD, Agent, Clock, Session
 from studio.station import header_of
-from studio.tasks import Progress
+from studio.takes import Takes
 from studio.twin import Twin
 
 FRAME_EVERY = 3  # ticks: 33 Hz
@@ -57,7 +56,6 @@ class LiveSession:
 
     def __init__(self, data_dir: Path, task: str, hub: Hub, *, seed: int = 0, cameras: bool = True) -> None:
         self._hub = hub
-        self._recorder = Recorder(data_dir)
         self._with_cameras = cameras
         self._config = ServoConfig()
         self._clock = Clock(CONTROL_PERIOD)
@@ -69,18 +67,14 @@ class LiveSession:
         self._agent: Agent
         self._ended = False
         self._driver: m.Driver = "nobody"
+        self._collector: m.Driver = "operator"  # who drives again after each reset while collecting
         self._operator = ""
-        self._take: Take | None = None
-        self._take_ticks = 0
-        self._countdown: float | None = None  # [s] left, while counting down
-        self._last_take: m.TakeStatus | None = None
-        self._collection = Collection()
+        self._takes = Takes(Recorder(data_dir), self._header, self._tell)
         self._limits: dict[int, tuple[float, Limit]] = {}  # newest of each arm, and when [s]
         self._told_state: dict[str, bytes] = {}
         self._told_images: dict[str, float] = {}
         self._ticks = 0
         self._alone_since: float | None = None
-        self._success_since: float | None = None
         self._load(task, seed, 1.0)
 
     # The loop
@@ -98,34 +92,31 @@ class LiveSession:
                 clock.wait()
         finally:
             self._robot.hold()
-            self._end_take(None, "the session ended")
+            self._takes.keep(None, "the session ended", self._robot.progress())
             self._close_cameras()
 
     def _advance(self) -> None:
-        subscribers: list[Subscriber] = [self._take] if self._take else []
-        step = self._session.tick(self._agent, subscribers, self._take_ticks if self._take else None)
+        """One tick of the robot."""
+        takes = self._takes
+        step = self._session.tick(self._agent, takes.subscribers, takes.tick)
         if step is None:  # the script is done
             self._set_driver("nobody", self._operator)
-            if self._take:
-                self._end_take(None, "the script finished")
+            takes.keep(None, "the script finished", self._robot.progress())
             return
-        if self._take:
-            self._take_ticks += 1
+        takes.count_tick()
         self._ticks += 1
         for limit in step.applied.limits:
             self._limits[limit.arm] = (time.monotonic(), limit)
         self._publish(step)
 
     def _look_around(self) -> None:
-        """What happens by itself: countdowns, failing disks, collecting, being left alone."""
-        if self._countdown is not None:
-            self._count_down()
-        if self._take and self._take.error:
-            error = self._take.error
-            self._end_take(None, error)
-            self._tell("error", error)
-        if self._collection.is_running:
-            self._collect()
+        """What happens by itself: countdowns, failing disks, the next scene to collect, being left alone."""
+        self._takes.advance(self._robot.progress(), self._driver)
+        if (seed := self._takes.due_seed()) is not None:
+            driver = self._collector = self._driver if self._driver != "nobody" else self._collector
+            self._reset(m.Reset(seed=seed, spread=self._robot.spread))
+            self._takes.start(self._takes.collection.countdown)
+            self._set_driver(driver, self._operator)
         self._watch_for_clients()
 
     def _watch_for_clients(self) -> None:
@@ -173,11 +164,12 @@ class LiveSession:
             case m.Reset():
                 self._reset(command)
             case m.StartTake():
-                self._start_countdown(command.countdown, command.operator)
+                self._operator = command.operator or self._operator
+                self._takes.start(command.countdown)
             case m.EndTake():
-                self._stop(command.judgement)
+                self._takes.stop(command.judgement, self._robot.progress())
             case m.DiscardTake():
-                self._discard()
+                self._takes.discard()
             case m.Collect():
                 self._start_collecting(command)
             case m.RestartCameras():
@@ -219,14 +211,12 @@ class LiveSession:
             self._agent.reset(self._robot.observe())
         else:
             self._agent = self._hands
-        if self._take:
-            self._take.add_event("driver", f"{driver} {operator}".strip())
+        self._takes.add_event("driver", f"{driver} {operator}".strip())
 
     def _reset(self, command: m.Reset) -> None:
-        if self._take:
+        if self._takes.phase != "idle":
             raise ValueError("A take is being recorded; stop it before resetting.")
         driver = self._driver if self._driver != "script" else "nobody"
-        self._countdown = None
         self._load(command.task or self._robot.task.name, command.seed, command.spread)
         self._set_driver(driver, self._operator)
         self._clock.restart()
@@ -249,110 +239,25 @@ class LiveSession:
         self._resets += 1
         self._limits.clear()
         self._told_state.clear()
-        self._success_since = None
 
-    # Takes
-
-    def _start_countdown(self, seconds: float, operator: str) -> None:
-        if self._take or self._countdown is not None:
-            raise ValueError("A take is running already.")
-        self._operator = operator or self._operator
-        self._countdown = max(0.0, seconds)
-        if seconds > 0:
-            self._tell("countdown", f"Recording in {seconds:.0f} s.")
-
-    def _count_down(self) -> None:
-        assert self._countdown is not None
-        self._countdown -= CONTROL_PERIOD
-        if self._countdown <= 0:
-            self._countdown = None
-            self._start_take()
-
-    def _start_take(self) -> None:
+    def _header(self) -> Header:
+        """Of a take that begins now; its time begins with it."""
         self._robot.restart_time()
-        try:
-            header = header_of(
-                self._robot,
-                agent={"operator": "gizmo", "script": "scripted", "nobody": "nobody"}[self._driver],
-                operator=self._operator or None,
-                has_images=self._cameras is not None and self._cameras.error is None,
-            )
-            self._take = self._recorder.start(header)
-        except OSError as error:
-            self._collection.stop()
-            self._tell("error", str(error))
-            return
-        self._take_ticks = 0
-        self._success_since = None
-        self._tell("recording", f"Recording {header.episode_id}.")
-
-    def _stop(self, judgement: m.Judgement | None) -> None:
-        if self._countdown is not None:
-            self._countdown = None
-            self._collection.stop()
-            return
-        if not self._take:
-            raise ValueError("No take is running.")
-        self._end_take(judgement, "stopped by the operator")
-
-    def _end_take(self, judgement: m.Judgement | None, reason: str) -> None:
-        """Keep the running take, if there is one."""
-        if self._take is None:
-            return
-        take, self._take = self._take, None
-        progress = self._robot.progress()
-        success = {"success": True, "failure": False, "unmarked": None, None: progress.success}[judgement]
-        path = take.finish(Outcome(success, f"{reason}: {progress.phase}", progress.value))
-        outcome: m.Judgement = "unmarked" if success is None else "success" if success else "failure"
-        self._last_take = m.TakeStatus(
-            episode_id=take.header.episode_id,
-            path=str(path),
-            seconds=self._take_ticks * CONTROL_PERIOD,
-            outcome=outcome,
-            discarded=False,
+        return header_of(
+            self._robot,
+            agent={"operator": "operator", "script": "scripted", "nobody": "nobody"}[self._driver],
+            operator=self._operator or None,
+            has_images=self._cameras is not None and self._cameras.error is None,
         )
-        self._collection.kept(time.monotonic())
-        self._tell("take kept", f"Kept as {outcome}: {take.header.episode_id}.", self._last_take)
-
-    def _discard(self) -> None:
-        if self._take:
-            take, self._take = self._take, None
-            path = take.discard()
-            seconds = self._take_ticks * CONTROL_PERIOD
-            self._last_take = m.TakeStatus(take.header.episode_id, str(path), seconds, "unmarked", True)
-            self._tell("take discarded", f"In the trash: {take.header.episode_id}.", self._last_take)
-            self._collection.again(time.monotonic())
-        elif self._countdown is not None:
-            self._countdown = None
-        else:
-            raise ValueError("No take is running.")
 
     def _start_collecting(self, command: m.Collect) -> None:
         if command.count <= 0:
-            self._collection.stop()
+            self._takes.collection.stop()
             return
-        if self._take:
+        if self._takes.phase != "idle":
             raise ValueError("A take is being recorded; stop it first.")
         self._operator = command.operator or self._operator
-        self._collection.start(command.count, command.seed, command.countdown)
-
-    def _collect(self) -> None:
-        """The next step of collecting: reset to the next seed, count down, end at success."""
-        now = time.monotonic()
-        if self._take:
-            if not self._robot.progress().success:
-                self._success_since = None
-            elif self._success_since is None:
-                self._success_since = now
-                self._tell("success", "Done.")
-            elif now - self._success_since >= HELD_SUCCESS and self._driver != "script":
-                self._end_take(None, "success")
-        elif self._countdown is None and self._collection.is_due(now):
-            driver = self._driver if self._driver != "nobody" else self._collection.driver
-            self._collection.driver = driver
-            self._reset(m.Reset(seed=self._collection.seed, spread=self._robot.spread))
-            self._start_countdown(self._collection.countdown, self._operator)
-            self._set_driver(driver, self._operator)
+        self._takes.collection.start(command.count, command.seed, command.countdown)
 
     # Reports
 
@@ -402,8 +307,8 @@ class LiveSession:
         return ("refused" if limit.refused else "limited"), limit.why
 
     def _status(self, now: float) -> m.Status:
-        robot = self._robot
-        progress: Progress = robot.progress()
+        robot, takes = self._robot, self._takes
+        progress = robot.progress()
         pace = self._clock.pace(PACE_WINDOW)
         arms = []
         for index, (setup, hand) in enumerate(zip(robot.task.arms, self._hands.hands, strict=True)):
@@ -427,14 +332,13 @@ class LiveSession:
             resets=self._resets,
             driver=self._driver,
             operator=self._operator,
-            phase="recording" if self._take else "countdown" if self._countdown is not None else "idle",
-            countdown=self._countdown or 0.0,
-            take_seconds=self._take_ticks * CONTROL_PERIOD if self._take else 0.0,
-            take_id=self._take.header.episode_id if self._take else "",
-            take_error=(self._take.error or "") if self._take else "",
-            last_take=self._last_take,
-            collected=self._collection.done,
-            to_collect=self._collection.count,
+            phase=takes.phase,
+            countdown=takes.countdown,
+            take_seconds=takes.seconds,
+            take_id=takes.running_id,
+            last_take=takes.last,
+            collected=takes.collection.done,
+            to_collect=takes.collection.count,
             progress=progress.value,
             success=progress.success,
             task_phase=progress.phase,
@@ -464,45 +368,6 @@ class LiveSession:
     def _close_cameras(self) -> None:
         if self._cameras:
             self._cameras.close()
-
-
-@dataclass(slots=True)
-class Collection:
-    """How far collecting is: which seed comes next, and when."""
-
-    count: int = 0  # takes to keep; 0 while not collecting
-    done: int = 0
-    seed: int = 0  # of the next take
-    countdown: float = 3.0  # [s]
-    driver: m.Driver = "operator"
-    _due: float = 0.0  # [s] monotonic time of the next reset
-
-    @property
-    def is_running(self) -> bool:
-        return self.count > 0
-
-    def start(self, count: int, seed: int, countdown: float) -> None:
-        self.count, self.done, self.seed, self.countdown, self._due = count, 0, seed, countdown, 0.0
-
-    def stop(self) -> None:
-        self.count = 0
-
-    def kept(self, now: float) -> None:
-        """A take was kept: on to the next seed, or done."""
-        if not self.is_running:
-            return
-        self.done += 1
-        self.seed += 1
-        self._due = now + BETWEEN_TAKES
-        if self.done >= self.count:
-            self.stop()
-
-    def again(self, now: float) -> None:
-        """A take was discarded: the same seed once more."""
-        self._due = now + BETWEEN_TAKES
-
-    def is_due(self, now: float) -> bool:
-        return now >= self._due
 
 
 class SessionRunning(RuntimeError):

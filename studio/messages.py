@@ -190,7 +190,6 @@ class Status(Message, frozen=True, kw_only=True):
     countdown: float  # [s] left
     take_seconds: float
     take_id: str  # of the running take; empty without one
-    take_error: str  # why recording stopped by itself
     last_take: TakeStatus | None
     collected: int
     to_collect: int  # 0 while not collecting
