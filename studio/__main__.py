@@ -11,7 +11,6 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,7 +26,8 @@ EpisodeId = Annotated[str, arg(metavar="ID", help="An episode; see `studio episo
 TaskName = Annotated[str, arg(metavar="TASK", help="A task; see `studio tasks`.")]
 
 DATA = Path("data")
-console = Console()
+UNLIMITED = 10_000  # [columns] where nobody sees the edge of a terminal: one row, one line
+console = Console(width=None if sys.stdout.isatty() else UNLIMITED)
 
 
 def show_tasks(json: Json = False) -> int:
@@ -155,7 +155,7 @@ def episodes(
     if json:
         _print_json(rows)
         return 0
-    table = _table("id", "outcome", "s", "N mean", "N peak", "quality", "flags", "operator", "recorded")
+    table = _table("id", "outcome", ">s", ">N", ">peak", "rated", "flags")
     for row in rows:
         table.add_row(
             row.episode_id,
@@ -163,10 +163,8 @@ def episodes(
             f"{row.duration:.1f}",
             f"{row.mean_force:.1f}",
             f"{row.peak_force:.1f}",
-            "" if row.quality is None else str(row.quality),
+            "" if row.quality is None else f"{row.quality}/5",
             ", ".join(row.flags),
-            row.operator,
-            f"{datetime.fromtimestamp(row.started):%Y-%m-%d %H:%M}",
         )
     console.print(table if rows else f"No episodes in {data}. Record some: studio demo wiping --episodes 3")
     for path, why in unreadable.items():
@@ -295,10 +293,19 @@ def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
     Args:
         only: Run only these parts.
     """
-    from studio.benchmarks import run
+    from studio.benchmarks import PARTS, run
 
     results = run(only, tell=None if json else lambda name: console.print(f"… {name}", style="dim"))
-    _print_json(results) if json else console.print_json(_encode(results))
+    if json:
+        _print_json(results)
+        return 0
+    table = _table("part", "what", ">measured", "goal", "met")
+    for goal in results["goals"]:
+        verdict = "yes" if goal["met"] else "NO"
+        table.add_row(goal["part"], goal["what"], f"{goal['measured']:.3g}", goal["goal"], verdict)
+    console.print(table)
+    loads = ", ".join(f"{part} {results[part]['load_average']:.1f}" for part in PARTS if part in results)
+    console.print(f"Load average: {loads}. Everything measured: studio bench --json")
     return 0
 
 
@@ -359,9 +366,11 @@ def _plain(value: Any) -> Any:
 
 
 def _table(*columns: str) -> Table:
+    """The first column is never folded; those that begin with ">" hold numbers."""
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for column in columns:
-        table.add_column(column, overflow="fold", justify="right" if column[0] in "sN" else "left")
+    for number, column in enumerate(columns):
+        justify: Literal["left", "right"] = "right" if column.startswith(">") else "left"
+        table.add_column(column.lstrip(">"), justify=justify, no_wrap=number == 0, overflow="fold")
     return table
 
 

@@ -1,1 +1,89 @@
-"""Measurements of our own parts, run by `studio bench`."""
+"""Measurements of our own parts, and the goals they are held against; run by `studio bench`."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from studio.recorder import versions
+
+PARTS = ("fdcc", "contact", "loop", "cameras", "episodes")  # modules with a `measure()`
+
+Results = dict[str, Any]  # what a part measured
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A bound on something that a part measured."""
+
+    part: str
+    what: str
+    value: Callable[[Results], float]
+    bound: Literal["<=", ">="]
+    limit: float
+
+    def against(self, results: Results) -> Results:
+        value = self.value(results)
+        met = value <= self.limit if self.bound == "<=" else value >= self.limit
+        goal = f"{self.bound} {self.limit:g}"
+        return {"part": self.part, "what": self.what, "measured": value, "goal": goal, "met": met}
+
+
+def run(only: Sequence[str] = (), tell: Callable[[str], None] | None = None) -> Results:
+    """Measure all parts, or `only` some, one after the other; `tell` is told the name of each as it begins.
+
+    The load average stands beside each part, as of its end: other programs slow what is measured.
+    """
+    unknown = set(only) - set(PARTS)
+    if unknown:
+        raise KeyError(f"No part {', '.join(sorted(unknown))}; there are {list(PARTS)}.")
+    results: Results = {"machine": {**versions(), "cores": os.cpu_count()}}
+    for part in only or PARTS:
+        if tell:
+            tell(part)
+        measured = importlib.import_module(f"{__name__}.{part}").measure()
+        results[part] = {**measured, "load_average": os.getloadavg()[0]}
+    results["goals"] = [goal.against(results[goal.part]) for goal in GOALS if goal.part in results]
+    return results
+
+
+def _deviation(kind: str) -> Callable[[Results], float]:
+    """[N] of the least quiet mode."""
+    return lambda results: max(press["std_N"] for press in results[kind].values())
+
+
+def _furthest(name: str) -> Callable[[Results], float]:
+    """How far a press's ratio is from one, at most over the modes."""
+    return lambda results: max(abs(press[name] - 1.0) for press in results["press"].values())
+
+
+def _rise(mode: str) -> Callable[[Results], float]:
+    """[s] on the slowest axis."""
+    return lambda results: max(step["rise_s"] for step in results["step"][mode].values())
+
+
+GOALS = (
+    Goal("fdcc", "FDCC step, times Pinocchio's bare calls", lambda r: r["ratio"], "<=", 4.0),
+    Goal("contact", "press, share off K (target - tcp)", _furthest("to_law"), "<=", 0.03),
+    Goal("contact", "press, share off K 10 mm", _furthest("to_depth"), "<=", 0.10),
+    Goal("contact", "press, standard deviation [N]", _deviation("press"), "<=", 0.1),
+    Goal("contact", "the same at twice error_scale [N]", _deviation("press_at_twice_error_scale"), "<=", 0.1),
+    Goal("contact", "20 mm step to 63 %, low [s]", _rise("low"), "<=", 0.50),
+    Goal("contact", "20 mm step to 63 %, medium [s]", _rise("medium"), "<=", 0.28),
+    Goal("contact", "20 mm step to 63 %, high [s]", _rise("high"), "<=", 0.20),
+    Goal("loop", "one arm in contact, times real time", lambda r: r["one_arm"], ">=", 8.0),
+    Goal("loop", "two arms in contact, times real time", lambda r: r["two_arms"], ">=", 4.0),
+    Goal("cameras", "240x320 image of two arms, CPU [ms]", lambda r: r["cpu_ms"], "<=", 10.0),
+    Goal(
+        "episodes",
+        "recorder besides JPEG, share of a core",
+        lambda r: r["recorder_share_of_core"],
+        "<=",
+        0.05,
+    ),
+    Goal("episodes", "columns of 60 s with two arms, CPU [s]", lambda r: r["columns_cpu_s"], "<=", 0.8),
+    Goal("episodes", "any image of a take [ms]", lambda r: r["frame_ms"], "<=", 6.0),
+)

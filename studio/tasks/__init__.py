@@ -137,9 +137,17 @@ def names() -> list[str]:
 
 
 def load(name: str) -> Task:
-    """A new instance of the task called `name`."""
+    """A new instance of the task called `name`, or of the one in the module of that full name."""
+    if "." in name:
+        return _task_in(name)
     if name not in names():
         raise KeyError(f"No task {name!r}; there are {names()}.")
-    module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
-    task: Task = module.Task()
+    return _task_in(f"{__name__}.{name.replace('-', '_')}")
+
+
+def _task_in(module: str) -> Task:
+    try:
+        task: Task = importlib.import_module(module).Task()
+    except ModuleNotFoundError as error:
+        raise KeyError(f"No task {module!r}: {error.msg}; there are {names()}.") from error
     return task

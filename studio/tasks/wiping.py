@@ -25,6 +25,7 @@ ERASER_HALF = np.array([0.015, 0.021])  # [m] half sides of the felt along tool 
 FELT_THICKNESS = 0.008  # [m]
 BLOCK_HEIGHT = 0.045  # [m]
 ERASER_MASS = 0.08  # [kg]
+ERASER_CENTER = np.array([0.0, 0.0, -0.0265])  # [m] of mass, from the felt's centre
 # Soft felt that stays quiet under FDCC and takes the edge off an impact.
 FELT_SOLREF = (0.008, 1.0)
 FELT_SOLIMP = (0.5, 0.95, 0.0015, 0.5, 2.0)
@@ -39,6 +40,8 @@ START_JITTER = 0.015  # [m] on each axis of the start pose
 WIPED_ENOUGH = 0.9  # share of the mark's cells
 LIFTED = 0.3  # [s] without contact that ends the go
 GO_STARTS = 0.02  # share wiped from which touching counts as the go
+
+LOW_LAG = 0.36  # [s] by which the tool trails its target at low stiffness (`studio bench --only contact`)
 
 # The tool points down: tool z = -z, tool x (where the fingers close) = -y, tool y = -x of the world.
 DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -73,12 +76,7 @@ class Task:
             world_from_home=Pose.of(DOWN, np.array([0.36, 0.0, 0.20])),
             modes=(StiffnessMode.MEDIUM, StiffnessMode.LOW),
             workspace=(np.array([0.25, -0.25, -0.03]), np.array([0.70, 0.25, 0.45])),
-            grasp=Grasp(
-                body="eraser",
-                flange_from_body=FLANGE_FROM_TCP,
-                mass=ERASER_MASS,
-                center=np.array([0.0, 0.0, -0.0265]),
-            ),
+            grasp=Grasp("eraser", FLANGE_FROM_TCP, ERASER_MASS, ERASER_CENTER),
         ),
     )
     cameras = (
@@ -104,33 +102,10 @@ class Task:
 
     def build(self, spec: mujoco.MjSpec) -> None:
         Board.build(spec, BOARD_CENTER)
-        eraser = spec.worldbody.add_body(name="eraser", mass=ERASER_MASS)
-        eraser.ipos = self.arms[0].grasp.center if self.arms[0].grasp else (0, 0, 0)
-        eraser.inertia = (4e-5, 3e-5, 2.5e-5)
-        eraser.explicitinertial = True
-        eraser.add_freejoint(name="eraser")
-        eraser.add_geom(
-            name="felt",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(*ERASER_HALF, FELT_THICKNESS / 2),
-            pos=(0, 0, -FELT_THICKNESS / 2),
-            rgba=(0.25, 0.27, 0.30, 1),
-            friction=FELT_FRICTION,
-            solref=FELT_SOLREF,
-            solimp=FELT_SOLIMP,
-            priority=2,
-        )
-        eraser.add_geom(
-            name="block",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(*ERASER_HALF, BLOCK_HEIGHT / 2),
-            pos=(0, 0, -FELT_THICKNESS - BLOCK_HEIGHT / 2),
-            rgba=(0.85, 0.55, 0.20, 1),
-            condim=6,
-        )
+        add_eraser(spec, "eraser")
 
     def bind(self, world: World) -> None:
-        self._felt_geom = world.model.geom("felt").id
+        self._felt_geom = world.model.geom("eraser_felt").id
         self._board_geom = world.model.geom("board").id
 
     def start_poses(self, rng: np.random.Generator, spread: float) -> tuple[Pose, ...]:
@@ -215,7 +190,7 @@ class Task:
         tilt = home.wxyz
         hover = begin + style.hover * up + (np.array([-0.03, 0.02, 0.0]) if style.slanted else 0.0)
         deep = style.depth * rng.uniform(0.85, 1.15) * up
-        lag = 0.48 * style.speed  # [m] the tool trails the target by this at low stiffness
+        lag = LOW_LAG * style.speed  # [m]
 
         for part in (
             hand.move(Pose(hover + jitter(0.003), tilt), rng.uniform(1.3, 1.7)),
@@ -246,3 +221,30 @@ class Task:
         ):
             for action in part:
                 yield Action((action,))
+
+
+def add_eraser(spec: mujoco.MjSpec, name: str) -> None:
+    """A free body, its origin in the middle of the felt's face; geoms `{name}_felt` and `{name}_block`."""
+    eraser = spec.worldbody.add_body(name=name, mass=ERASER_MASS, ipos=ERASER_CENTER)
+    eraser.inertia = (4e-5, 3e-5, 2.5e-5)
+    eraser.explicitinertial = True
+    eraser.add_freejoint(name=name)
+    eraser.add_geom(
+        name=f"{name}_felt",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(*ERASER_HALF, FELT_THICKNESS / 2),
+        pos=(0, 0, -FELT_THICKNESS / 2),
+        rgba=(0.25, 0.27, 0.30, 1),
+        friction=FELT_FRICTION,
+        solref=FELT_SOLREF,
+        solimp=FELT_SOLIMP,
+        priority=2,
+    )
+    eraser.add_geom(
+        name=f"{name}_block",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(*ERASER_HALF, BLOCK_HEIGHT / 2),
+        pos=(0, 0, -FELT_THICKNESS - BLOCK_HEIGHT / 2),
+        rgba=(0.85, 0.55, 0.20, 1),
+        condim=6,
+    )
