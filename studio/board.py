@@ -76,7 +76,15 @@ class Board:
     def draw(self, points: Array, radius: float) -> None:
         """Ink the polyline `points` (n, 2) [m] in board axes with a round nib of `radius` [m]."""
         for start, end in itertools.pairwise(points):
-            self.grid[self._near_segment(start, end, radius)] = 255
+            window, distance = self._near_segment(start, end, radius)
+            self.grid[window][distance <= radius] = 255
+
+    def stroke(self, start: Array, end: Array, radius: float) -> None:
+        """Ink the line between two points (2,) [m]; its soft edge shows widths below a cell."""
+        window, distance = self._near_segment(start, end, radius + CELL)
+        level = 255 * np.clip((radius - distance) / CELL + 0.5, 0.0, 1.0)
+        cells = self.grid[window]
+        np.maximum(cells, level.astype(np.uint8), out=cells)
 
     def wipe(self, center: Array, axes: Array, half: Array, height: float, rub: float, force: float) -> None:
         """Rub with a flat rectangular felt.
@@ -120,13 +128,14 @@ class Board:
         self.grid[:] = state["ink"]
         self._carry = float(state["ink_carry"][0])
 
-    def _near_segment(self, start: Array, end: Array, radius: float) -> Array:
+    def _near_segment(self, start: Array, end: Array, reach: float) -> tuple[tuple[slice, slice], Array]:
+        """A window with all cells within `reach` [m] of a line, and their distances [m] from it."""
+        window = self._window(np.minimum(start, end) - reach, np.maximum(start, end) + reach)
         direction = end - start
         length_squared = float(direction @ direction)
-        dx, dy = self._x - start[0], self._y - start[1]
+        dx, dy = self._x[window] - start[0], self._y[window] - start[1]
         along = np.clip((dx * direction[0] + dy * direction[1]) / max(length_squared, 1e-12), 0.0, 1.0)
-        near: Array = np.hypot(dx - along * direction[0], dy - along * direction[1]) <= radius
-        return near
+        return window, np.hypot(dx - along * direction[0], dy - along * direction[1])
 
     @staticmethod
     def _window(low: Array, high: Array) -> tuple[slice, slice]:
