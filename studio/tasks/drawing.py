@@ -57,7 +57,7 @@ BARREL_START = 0.030  # [m] from the nib's tip
 TIP_RADIUS = 0.003  # [m]
 # A soft nib, quiet under FDCC like the eraser's felt.
 NIB_SOLREF = (0.008, 1.0)
-NIB_SOLIMP = (0.5, 0.95, 0.0015, 0.5, 2.0)
+NIB_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 NIB_FRICTION = (0.2, 0.005, 0.0001)
 
 # The tool points down: tool z = -z, tool x (where the fingers close) = -y, tool y = -x of the world.
@@ -182,7 +182,7 @@ class Task:
         return Board.TEXTURE, self.board.picture()
 
     def demonstrate(self, world: World, rng: np.random.Generator) -> Iterator[Action]:
-        """Three strokes: hover, descend, press at low stiffness, draw, let the pen catch up, lift; then home."""
+        """Three strokes, then home."""
         style = STYLES[rng.integers(len(STYLES))]
         home = world.tcp("right")
         hand = Motion(home, StiffnessMode.MEDIUM, gripper=0.0, speed=rng.uniform(0.85, 1.2))
@@ -200,7 +200,7 @@ class Task:
 
     @staticmethod
     def _draw(hand: Motion, line: Array, style: Style, rng: np.random.Generator) -> Iterator[ArmAction]:
-        """One stroke along `line` (n, 2) [m] in board axes, from hover to hover."""
+        """Hover, descend, press at low stiffness, follow `line` (n, 2) [m] in board axes, catch up, lift."""
         tilt = hand.pose.wxyz
         path = BOARD_CENTER + np.pad(line, ((0, 0), (0, 1)))
         up = np.array([0.0, 0.0, 1.0])
@@ -223,9 +223,7 @@ def smile() -> tuple[Array, Array, Array]:
     down = np.linspace(*EYE, 9)
     left, right = (np.stack((down, np.full(9, side)), axis=1) for side in (-EYE_SIDE, EYE_SIDE))
     angle = np.linspace(-MOUTH_REACH, MOUTH_REACH, 31)
-    mouth = np.stack(
-        (MOUTH_CENTER + MOUTH_RADIUS * np.cos(angle), MOUTH_RADIUS * np.sin(angle)), axis=1
-    )
+    mouth = np.stack((MOUTH_CENTER + MOUTH_RADIUS * np.cos(angle), MOUTH_RADIUS * np.sin(angle)), axis=1)
     return left, right, mouth
 
 
