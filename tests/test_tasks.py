@@ -1,0 +1,149 @@
+"""What every task promises, whichever it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from controller.types import Action, ArmAction, CartesianTarget, Hold, Observation, Step
+from studio import tasks
+from studio.inputs.scripted import ScriptedAgent
+from studio.session import Session
+from studio.twin import Twin
+
+
+@pytest.fixture(scope="module", params=tasks.names())
+def twin(request: pytest.FixtureRequest) -> Twin:
+    return Twin(tasks.load(request.param))
+
+
+class Still:
+    """Does nothing, for as long as it may."""
+
+    def __init__(self, n_arms: int) -> None:
+        self._action = Action((ArmAction(Hold(), 0.0),) * n_arms)
+
+    def reset(self, observation: Observation) -> None: ...
+
+    def act(self, observation: Observation) -> Action | None:
+        return self._action
+
+
+class Watch:
+    """Remembers what a demonstration asked for, and what the robot made of it."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+
+    def on_step(self, step: Step) -> None:
+        self.steps.append(step)
+
+
+def test_a_task_describes_itself(twin: Twin) -> None:
+    task = twin.task
+    assert tasks.load(task.name).name == task.name
+    assert task.instruction.endswith(".")
+    assert len({arm.name for arm in task.arms}) == len(task.arms) in (1, 2)
+    cameras = [view.name for view in task.cameras]
+    assert cameras == list(dict.fromkeys(cameras))
+    assert "front" in cameras
+    for view in task.cameras:
+        assert twin.model.camera(view.name).fovy[0] == view.fovy
+    for arm in task.arms:
+        assert len(set(arm.modes)) in (1, 2)
+        assert (arm.workspace[0] < arm.workspace[1]).all()
+    if (painted := task.texture()) is not None:
+        name, picture = painted
+        texture = twin.model.texture(name)
+        assert picture.shape == (int(texture.height[0]), int(texture.width[0]), 3)
+        assert picture.dtype == np.uint8
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_episode_begins_at_rest_inside_the_workspace_with_nothing_done(twin: Twin, seed: int) -> None:
+    twin.reset(seed)
+    progress = twin.progress()
+    assert not progress.success
+    assert 0.0 <= progress.value < 0.5
+    for arm, setup in zip(twin.observe().arms, twin.task.arms, strict=True):
+        position = arm.base_from_tcp.position + setup.base_position
+        assert (position > setup.workspace[0]).all()
+        assert (position < setup.workspace[1]).all()
+        assert np.abs(arm.dq).max() < 0.02
+        np.testing.assert_allclose(arm.wrench.vector, 0.0, atol=0.05)
+
+
+def test_seeds_draw_different_instances_and_repeat(twin: Twin) -> None:
+    digests = []
+    for seed in (0, 1, 2, 0):
+        twin.reset(seed)
+        digests.append(twin.digest())
+    assert digests[0] == digests[3]
+    assert len(set(digests)) == 3
+
+
+def test_a_demonstration_succeeds_and_stays_within_the_limits(twin: Twin) -> None:
+    twin.reset(0)
+    watch = Watch()
+    ending = Session(twin).run(ScriptedAgent(twin, 0), [watch], time_limit=twin.task.time_limit)
+    assert ending.reason == "finished"
+    assert ending.progress.success
+    assert not [limit for step in watch.steps for limit in step.applied.limits]
+    modes = {
+        step.requested.arms[0].target.stiffness.diagonals[0]
+        for step in watch.steps
+        if isinstance(step.requested.arms[0].target, CartesianTarget)
+    }
+    assert len(modes) == len(set(twin.task.arms[0].modes))
+
+
+def test_the_same_seed_demonstrates_the_same_and_another_seed_another(twin: Twin) -> None:
+    def first_actions(seed: int) -> list[float]:
+        twin.reset(0)
+        agent, observation = ScriptedAgent(twin, seed), twin.observe()
+        agent.reset(observation)
+        actions = [agent.act(observation) for _ in range(100)]
+        targets = [action.arms[0].target for action in actions if action is not None]
+        return [float(target.base_from_target.position @ [1, 2, 3]) for target in targets]
+
+    assert first_actions(0) == first_actions(0) != first_actions(1)
+
+
+def test_doing_nothing_fails(twin: Twin) -> None:
+    twin.reset(0)
+    ending = Session(twin).run(Still(len(twin.task.arms)), time_limit=twin.task.time_limit)
+    assert ending.reason == "time limit"
+    assert not ending.progress.success
+
+
+def test_a_demonstration_goes_on_to_the_bit_from_any_snapshot(twin: Twin) -> None:
+    twin.reset(1)
+    agent = ScriptedAgent(twin, 1)
+    agent.reset(twin.observe())
+    actions = list(iter(lambda: agent.act(twin.observe()), None))
+    saved = len(actions) // 2
+
+    def play(part: list[Action]) -> list[bytes]:
+        digests = []
+        for action in part:
+            twin.apply(action)
+            digests.append(twin.digest())
+        return digests
+
+    play(actions[:saved])
+    twin.observe()
+    snapshot, state = twin.save(), twin.task_state()
+    rest = actions[saved : saved + 200]
+    expected = play(rest)
+    twin.reset(2)
+    twin.restore(snapshot)
+    twin.observe()
+    for name, array in twin.task_state().items():
+        np.testing.assert_array_equal(array, state[name])
+    assert play(rest) == expected
+
+
+def test_an_unknown_task_is_refused_with_what_there_is() -> None:
+    for name in ("whiping", "studio.nowhere"):
+        with pytest.raises(KeyError, match="wiping"):
+            tasks.load(name)
