@@ -1,7 +1,7 @@
 """Single-arm wiping: rub a mark off a whiteboard in one go, with the eraser in the hand from the start.
 
 The mark is a curved line along y, at most 3 cm across it, its centre anywhere within 5 cm of the board's
-centre. The eraser is 4.2 cm across the line, so a sweep that ignores where the mark is misses most of them.
+centre. The eraser is 3.4 cm across the line, so a sweep that ignores where the mark is misses most of them.
 All numbers below were fixed before any policy was trained.
 """
 
@@ -21,7 +21,7 @@ from studio.tasks import ArmSetup, CameraView, Grasp, Progress, World
 
 BOARD_CENTER = np.array([0.50, 0.0, 0.02])  # [m] top face, in the world
 
-ERASER_HALF = np.array([0.015, 0.021])  # [m] half sides of the felt along tool x and y: 3 cm by 4.2 cm
+ERASER_HALF = np.array([0.015, 0.017])  # [m] half sides of the felt along tool x and y: 3 cm by 3.4 cm
 FELT_THICKNESS = 0.008  # [m]
 BLOCK_HEIGHT = 0.045  # [m]
 ERASER_MASS = 0.08  # [kg]
