@@ -1,0 +1,1 @@
+"""The page: a viser server, its scene and one file per tab."""
