@@ -1,0 +1,315 @@
+"""The Teleop tab: what is on the stage, who drives, each arm, the take, collecting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from html import escape
+from typing import Any, Final
+
+import viser
+
+from studio import tasks
+from studio.messages import ArmStatus, Status
+from studio.tasks import ArmSetup
+from studio.ui.desk import CHOICES, Choice, Desk
+from studio.ui.keys import Keypad
+from studio.ui.status import clock, mode_words
+
+ACTIVE: Final = "blue"
+PASSIVE: Final = "dark"
+LABELS: dict[Choice, str] = {"gizmo": "Gizmo", "keyboard": "Keys", "script": "Script", "nobody": "Nobody"}
+MOST_TAKES = 1000
+
+
+class TeleopTab:
+    """Built into the container that is open; `show` keeps it up to date."""
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk, keypad: Keypad) -> None:
+        with gui.add_folder(None, order=1.0):
+            self._scene = _SceneRows(gui, desk)
+        with gui.add_folder("Who drives", order=2.0):
+            self._driver = _DriverRows(gui, desk, keypad)
+        with gui.add_folder("Take", order=4.0):
+            self._take = _TakeRows(gui, desk)
+        with gui.add_folder("Collect", order=5.0):
+            self._collect = _CollectRows(gui, desk)
+        self._gui, self._desk = gui, desk
+        self._arms: list[_ArmRows] = []
+        self._container = gui.add_folder(None, order=3.0)
+
+    def set_task(self, arms: Sequence[ArmSetup]) -> None:
+        """Another task is on the stage: it has other arms."""
+        for rows in self._arms:
+            rows.remove()
+        with self._container:
+            self._arms = [_ArmRows(self._gui, self._desk, index, setup) for index, setup in enumerate(arms)]
+
+    def show(self, status: Status) -> None:
+        self._scene.show(status)
+        self._driver.show(status)
+        self._take.show(status)
+        self._collect.show(status)
+        for rows, arm in zip(self._arms, status.arms, strict=False):
+            rows.show(arm, status)
+
+
+class _SceneRows:
+    def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
+        _columns(gui, 2)
+        self._task = gui.add_dropdown("Task", tasks.names())
+        self._seed = gui.add_number(
+            "Seed", 0, min=0, step=1, hint="Draws the scene; the same seed, the same scene."
+        )
+        self._resets = -1
+        _columns(gui, 2)
+        again = gui.add_button("Reset scene", color=PASSIVE, icon=viser.Icon.REFRESH)
+        following = gui.add_button("Next seed", color=PASSIVE, icon=viser.Icon.PLAYER_TRACK_NEXT)
+
+        @self._task.on_update
+        def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+            if event.client is not None:  # not our own `show`
+                desk.reset(self._seed.value, self._task.value)
+
+        on_click(again, lambda: desk.reset(self._seed.value))
+        on_click(following, desk.next_seed)
+        self._buttons = (again, following)
+
+    def show(self, status: Status) -> None:
+        if status.resets != self._resets:  # else it is a person's, who may be typing
+            self._resets = status.resets
+            set_value(self._task, status.task)
+            set_value(self._seed, status.seed)
+        for widget in (*self._buttons, self._task):
+            widget.disabled = status.phase == "recording"
+
+
+class _DriverRows:
+    def __init__(self, gui: viser.GuiApi, desk: Desk, keypad: Keypad) -> None:
+        self._desk, self._keypad = desk, keypad
+        name = gui.add_text("Operator", desk.operator, hint="Your name, kept with each take.")
+        _columns(gui, 4)
+        self._buttons = {
+            choice: gui.add_button(LABELS[choice], color=PASSIVE, hint=f"Key {index % len(CHOICES)}")
+            for index, choice in enumerate(CHOICES, start=1)
+        }
+        self._hint = gui.add_html("")
+        keypad.build(gui)
+
+        @name.on_update
+        def _(_: object) -> None:
+            desk.operator = name.value
+
+        for choice, button in self._buttons.items():
+            on_click(button, partial(desk.drive, choice))
+
+    def show(self, status: Status) -> None:
+        active = active_choice(status, self._desk.choice)
+        for choice, button in self._buttons.items():
+            _set_active(button, LABELS[choice], choice == active)
+        self._keypad.show(status, visible=active == "keyboard")
+        self._hint.content = f'<div class="text dim">{_DRIVER_HINTS[active]}</div>'
+
+
+_DRIVER_HINTS: dict[Choice, str] = {
+    "gizmo": "Drag the arrows at the tool; left alone it stays.",
+    "keyboard": "Hold a key or button; directions follow your view.",
+    "script": "The task's own demonstration runs.",
+    "nobody": "The arms hold. Choosing who drives moves nothing.",
+}
+
+
+class _ArmRows:
+    """One arm: stiffness, gripper, parking."""
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk, arm: int, setup: ArmSetup) -> None:
+        self._resets = -1
+        self._desk, self._arm = desk, arm
+        self._rest = 0.0 if setup.grasp else setup.gripper
+        self._folder = gui.add_folder(f"{setup.name.capitalize()} arm")
+        key = "Shift+" if arm == 1 else ""
+        with self._folder:
+            _columns(gui, 2)
+            self._modes = {
+                mode.value: gui.add_button(mode.value, color=PASSIVE, hint=f"{key}M switches")
+                for mode in sorted(setup.modes, key=lambda mode: ("low", "medium", "high").index(mode.value))
+            }
+            self._gripper = gui.add_slider(
+                "Gripper", 0.0, 1.0, 0.01, self._rest, hint=f"0 closed, 1 open. {key}G opens or closes."
+            )
+            _columns(gui, 2)
+            self._park = gui.add_button("Park", color=PASSIVE, hint=f"{key}P. A parked arm holds.")
+            release = gui.add_button(
+                "Let go", color=PASSIVE, hint="F. Every arm stops pressing and waits to be engaged."
+            )
+
+        for mode, button in self._modes.items():
+            on_click(button, partial(desk.set_mode, arm, mode))
+
+        @self._gripper.on_update
+        def _(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+            if event.client is not None:
+                desk.set_gripper(arm, self._gripper.value)
+
+        @self._park.on_click
+        def _(_: object) -> None:
+            desk.toggle_engaged(arm)
+
+        on_click(release, desk.release)
+
+    def show(self, arm: ArmStatus, status: Status) -> None:
+        for mode, button in self._modes.items():
+            _set_active(button, _sentence(mode_words(mode)), mode == arm.mode)
+        if status.resets != self._resets:
+            self._resets = status.resets
+            self._desk.grippers[self._arm] = self._rest
+        set_value(self._gripper, self._desk.grippers[self._arm])
+        self._park.label = "Park" if arm.engaged else "Engage"
+        self._park.color = PASSIVE if arm.engaged else ACTIVE
+        self._park.disabled = status.driver != "operator"
+
+    def remove(self) -> None:
+        self._folder.remove()
+
+
+class _TakeRows:
+    def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
+        self._desk = desk
+        self._state = gui.add_html("")
+        self._start = gui.add_button("Start take", color="red", icon=viser.Icon.PLAYER_RECORD)
+        _columns(gui, 3)
+        self._success = gui.add_button("Success", color="green", hint="Y. Stop and keep as a success.")
+        self._failure = gui.add_button("Failure", color=PASSIVE, hint="N. Stop and keep as a failure.")
+        self._discard = gui.add_button("Discard", color=PASSIVE, hint="X. The take goes to the trash.")
+        self._last = gui.add_html("")
+        self._undo = gui.add_button(
+            "Undo discard", color=ACTIVE, icon=viser.Icon.ARROW_BACK_UP, visible=False
+        )
+        _columns(gui, 2)
+        countdown = gui.add_number(
+            "Countdown", desk.countdown, min=0.0, max=30.0, step=1.0, hint="Seconds before recording."
+        )
+        sounds = gui.add_checkbox("Sounds", True)
+
+        on_click(self._start, desk.toggle_take)
+        on_click(self._success, partial(desk.keep, "success"))
+        on_click(self._failure, partial(desk.keep, "failure"))
+        on_click(self._discard, desk.discard)
+        on_click(self._undo, desk.undo_discard)
+
+        @countdown.on_update
+        def _(_: object) -> None:
+            desk.countdown = countdown.value
+
+        @sounds.on_update
+        def _(_: object) -> None:
+            desk.with_sounds = sounds.value
+
+    def show(self, status: Status) -> None:
+        last = status.last_take
+        is_gone = last is not None and self._desk.is_discarded(last)
+        self._state.content = progress(status)
+        self._start.label = {
+            "idle": "Start take (R)",
+            "countdown": "Cancel countdown (R)",
+            "recording": f"Stop and keep (R)  {clock(status.take_seconds)}",
+        }[status.phase]
+        self._start.color = "orange" if status.phase == "countdown" else "red"
+        is_recording = status.phase == "recording"
+        self._success.disabled = self._failure.disabled = not is_recording
+        self._discard.disabled = not is_recording and (last is None or is_gone)
+        self._discard.label = "Discard" if is_recording or last is None else "Discard last"
+        self._undo.visible = is_gone
+        self._last.content = last_take(status, is_gone)
+
+
+class _CollectRows:
+    def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
+        self._state = gui.add_html("")
+        _columns(gui, 2)
+        self._count = gui.add_number("Takes", 30, min=1, max=MOST_TAKES, step=1)
+        self._seed = gui.add_number("Seed", 0, min=0, step=1, hint="Of the first; then one more each.")
+        self._button = gui.add_button("Collect", color=ACTIVE, icon=viser.Icon.REPEAT)
+        self._is_collecting = False
+
+        @self._button.on_click
+        def _(_: object) -> None:
+            if self._is_collecting:
+                desk.stop_collecting()
+            else:
+                desk.collect(self._count.value, self._seed.value)
+
+    def show(self, status: Status) -> None:
+        self._is_collecting = status.to_collect > 0
+        self._state.content = counter(status)
+        self._button.label = "Stop collecting" if self._is_collecting else "Collect"
+        self._button.color = "orange" if self._is_collecting else ACTIVE
+        self._count.disabled = self._seed.disabled = self._is_collecting
+
+
+def active_choice(status: Status, chosen: Choice) -> Choice:
+    """Who drives, as one of the choices on the page."""
+    if status.driver == "operator":
+        return "keyboard" if chosen == "keyboard" else "gizmo"
+    return status.driver
+
+
+def progress(status: Status) -> str:
+    """The instruction and how far it is, as HTML."""
+    color = "good" if status.success else "calm"
+    done = " done" if status.success else ""
+    return (
+        f'<div class="text">{escape(status.instruction)}<div class="gauge" style="padding:0">'
+        f'<div class="track {color}"><div class="fill" style="width:{status.progress:.0%}"></div></div>'
+        f'<div class="row dim"><span>{escape(status.task_phase)}</span>'
+        f'<span class="{color}">{status.progress:.0%}{done}</span></div></div></div>'
+    )
+
+
+def last_take(status: Status, is_gone: bool) -> str:
+    """What became of the last take, as HTML."""
+    take = status.last_take
+    if take is None:
+        return '<div class="text dim">No take yet.</div>'
+    color = {"success": "good", "failure": "refused", "unmarked": "dim"}[take.outcome]
+    what = "in the trash" if is_gone else f'<b class="{color}">{take.outcome}</b>'
+    return (
+        f'<div class="text">Last take {what}, {take.seconds:.1f} s'
+        f'<br><span class="dim">{escape(take.episode_id)}</span></div>'
+    )
+
+
+def counter(status: Status) -> str:
+    """7 / 30, as HTML."""
+    if status.to_collect == 0:
+        return '<div class="text dim">Rising seeds; each take ends at success.</div>'
+    share = status.collected / status.to_collect
+    return (
+        f'<div class="gauge"><div class="row"><span>Kept, seed {status.seed} is on the stage</span>'
+        f'<span class="newtons">{status.collected} / {status.to_collect}</span></div>'
+        f'<div class="track good"><div class="fill" style="width:{share:.1%}"></div></div></div>'
+    )
+
+
+def _columns(gui: viser.GuiApi, count: int) -> None:
+    """Put the next `count` widgets side by side; `web_assets/page.css` does it."""
+    gui.add_html(f'<i class="c{count}"></i>')
+
+
+def _set_active(button: viser.GuiButtonHandle, label: str, is_active: bool) -> None:
+    """Say and show that this one of several is chosen."""
+    button.label = f"● {label}" if is_active else label
+    button.color = ACTIVE if is_active else PASSIVE
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:]
+
+
+def on_click(button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
+    button.on_click(lambda _: action())
+
+
+def set_value(widget: Any, value: object) -> None:
+    """Show a value that is not a person's; callbacks see it without a client."""
+    widget.value = value
