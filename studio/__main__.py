@@ -288,6 +288,29 @@ def replay(
     return int(check and not result.is_exact and not result.other_versions)
 
 
+def serve(
+    data: Data = DATA,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    task: str = "wiping",
+    cameras: bool = True,
+    open: bool = False,
+) -> int:
+    """Serve the page: drive, record and review in the browser, until Ctrl-C.
+
+    Args:
+        host: Where to listen; only this machine by default.
+        port: 0 takes a free one.
+        task: What is on the stage first.
+        cameras: Render images.
+        open: Open the page in this machine's browser.
+    """
+    from studio import serve as server
+
+    server.serve(data, host, port, task, cameras=cameras, open_page=open, tell=_say)
+    return 0
+
+
 def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
     """Measure speed and contact on this machine: medians, with the load average beside them.
 
@@ -311,6 +334,7 @@ def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
 
 
 COMMANDS: dict[str, Callable[..., int]] = {
+    "serve": serve,
     "tasks": show_tasks,
     "doctor": doctor,
     "demo": demo,
@@ -339,6 +363,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _complain(str(error))
         status = 1
     sys.exit(status)
+
+
+def _say(text: str) -> None:
+    """At once, also where the output is a pipe."""
+    print(text, flush=True)
 
 
 def _complain(text: object) -> None:

@@ -39,7 +39,7 @@ LAYERS = (
     ("twin", "cameras", "inputs"),
     ("recorder", "catalog", "replay", "evaluate", "jobs", "export"),
     ("api",),
-    ("server", "ui", "__main__"),
+    ("server", "ui", "serve", "__main__"),
 )
 SKINS = len(LAYERS) - 1
 

@@ -1,0 +1,184 @@
+"""`studio serve` with real processes: locks, orderly ends, and kills of each process."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from visitor import wait_for
+
+from studio import messages as m
+from studio.api import Studio
+from studio.link import socket_path
+from studio.serve import LOCK, SessionProcess
+from studio.server import start_viser
+from studio.ui.app import Page
+from studio.ui.remote import Remote
+
+URL = re.compile(r"at (http://127\.0\.0\.1:\d+)")
+
+
+class Served:
+    """A `studio serve` on a folder, in a process of its own."""
+
+    def __init__(self, data: Path, *options: str) -> None:
+        self.data = data
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "studio",
+                "serve",
+                "--data",
+                str(data),
+                "--port",
+                "0",
+                "--no-cameras",
+                *options,
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.said: list[str] = []
+
+    def url(self) -> str:
+        """As soon as the page is served and the session drives."""
+        assert self.process.stdout
+        for line in self.process.stdout:
+            self.said.append(line)
+            if found := URL.search(line):
+                return found[1]
+        raise AssertionError(f"It ended: {self.said} {self.process.communicate()}")
+
+    def health(self, url: str) -> dict[str, Any]:
+        health: dict[str, Any] = httpx.get(f"{url}/api/v1/health").json()
+        return health
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        self.process.communicate(timeout=30)  # closes the pipes
+        return self.process.returncode
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Iterator[Path]:
+    """A data folder; whatever session still runs on it ends with the test."""
+    yield tmp_path
+    SessionProcess(tmp_path, "wiping").end()
+
+
+def alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def start_take(data: Path) -> Remote:
+    """A client that has a take recorded for a while."""
+    remote = Remote()
+    remote.connect(socket_path(data))
+    remote.post(m.StartTake(countdown=0.0, operator="ana"))
+    wait_for(lambda: (status := remote.status.get()[0]) and status.take_seconds > 0.7)
+    return remote
+
+
+def test_a_second_server_and_a_busy_port_are_refused_and_the_first_ends_in_order(
+    data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    served = Served(data)
+    url = served.url()
+    health = served.health(url)
+    assert (health["session"], health["phase"], health["take"]) == ("open", "idle", None)
+    assert json.loads((data / LOCK).read_text()) == {"pid": served.process.pid, "url": url}
+
+    second = Served(data)
+    _, complaint = second.process.communicate(timeout=30)
+    assert second.process.returncode == 1
+    assert complaint.strip().splitlines() == [
+        f"studio: {data} is served already at {url} (process {served.process.pid})."
+    ]
+    other = Served(tmp_path_factory.mktemp("other"), "--port", url.rpartition(":")[2])
+    _, complaint = other.process.communicate(timeout=30)
+    assert other.process.returncode == 1
+    assert len(complaint.strip().splitlines()) == 1
+    assert "in use" in complaint
+
+    remote = start_take(data)
+    session = health["session_pid"]
+    assert served.end(signal.SIGINT) == 0
+    assert not alive(session)
+    assert wait_for(lambda: remote.state == "closed")
+    assert [path.suffix for path in data.glob("episodes/wiping/*")] == [".mcap"]  # kept, not torn
+    assert not (data / LOCK).read_text()
+
+
+def test_a_take_goes_on_while_the_web_process_is_killed_and_comes_back(data: Path) -> None:
+    first = Served(data)
+    health = first.health(first.url())
+    remote = start_take(data)
+    first.end(signal.SIGKILL)
+    status, _ = remote.status.get()
+    assert status is not None
+    before = status.take_seconds
+    second = Served(data)
+    again = second.health(second.url())
+    assert any(f"process {health['session_pid']}" in line for line in second.said)
+    assert (again["session_pid"], again["take"]) == (health["session_pid"], status.take_id)
+    assert wait_for(lambda: (now := remote.status.get()[0]) and now.take_seconds > before + 0.5)
+    assert second.end() == 0
+
+
+def test_a_session_killed_while_recording_is_restarted_and_its_take_recovered(data: Path) -> None:
+    viewer = start_viser()
+    process = SessionProcess(data, "wiping", cameras=False)
+    with Studio(data) as studio:
+        page = Page(viewer, studio, process)
+        process.start()
+        process.connect(page.remote)
+        page.start()
+        assert process.pid is not None
+        killed = process.pid
+        remote = start_take(data)
+        os.kill(killed, signal.SIGKILL)
+        wait_for(lambda: page.remote.state == "closed")
+        (torn,) = data.glob("episodes/wiping/*.part")
+        page.restart_session()
+        wait_for(lambda: page.remote.state == "open" and process.pid not in (None, killed))
+        (recovered,) = data.glob("episodes/wiping/*.mcap")
+        assert recovered.name == torn.name.removesuffix(".part")
+        (row,) = studio.episodes()
+        assert row.duration > 0.4
+        remote.close()
+        page.close()
+    viewer.stop()
+    process.end()
+    assert process.find() is None
+
+
+def test_a_session_that_does_not_answer_is_killed_at_the_end(data: Path) -> None:
+    process, remote = SessionProcess(data, "wiping", cameras=False), Remote()
+    process.start()
+    process.connect(remote)
+    pid = process.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    wait_for(lambda: remote.state == "stuck")
+    process.end()
+    assert not alive(pid)
+
+
+def test_a_session_that_cannot_start_says_why(data: Path) -> None:
+    process = SessionProcess(data, "no-such-task", cameras=False)
+    process.start()
+    with pytest.raises(RuntimeError, match="no-such-task"):
+        process.connect(Remote())
