@@ -145,11 +145,11 @@ class RenderedCameras:
             self._process, self.error = None, str(error)
 
     def newest(self, twin: Twin) -> Mapping[str, Image]:
-        """The newest images; rendered afresh where 50 ms have passed since the last, or time went back."""
+        """The newest images; rendered afresh where 50 ms have passed since the last, or none at all."""
         if self._process is None:
             return {}
         now = twin.data.time
-        if -PERIOD <= now - self._due < -1e-9 and self._images:
+        if -PERIOD < now - self._due < -1e-9 and self._images:
             return self._images
         painted = twin.task.texture()
         texture = painted[1] if painted else None

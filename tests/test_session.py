@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
+from agents import STAY, Listener, Script
 
 from controller.types import (
     ARM_ROW_WIDTH,
     Action,
     Applied,
-    ArmAction,
     ArmState,
-    Hold,
     Observation,
     Pose,
     Snapshot,
@@ -24,8 +21,6 @@ from studio.inputs.scripted import ScriptedAgent
 from studio.session import CONTROL_PERIOD, LATE, Clock, Session
 from studio.tasks import Progress
 from studio.twin import Twin
-
-STAY = Action((ArmAction(Hold(), 0.0),))
 
 
 class Robot:
@@ -59,31 +54,6 @@ class Robot:
 
     def progress(self) -> Progress:
         return Progress(0.0, self.periods >= self.patience, "waiting")
-
-
-class Script:
-    """An agent that plays a list; an exception in it is raised."""
-
-    def __init__(self, actions: Sequence[Action | Exception | None]) -> None:
-        self.actions = list(actions)
-
-    def reset(self, observation: Observation) -> None:
-        self.rest = iter(self.actions)
-
-    def act(self, observation: Observation) -> Action | None:
-        match next(self.rest, None):
-            case Exception() as error:
-                raise error
-            case action:
-                return action
-
-
-class Listener:
-    def __init__(self) -> None:
-        self.steps: list[Step] = []
-
-    def on_step(self, step: Step) -> None:
-        self.steps.append(step)
 
 
 def test_the_robot_is_held_when_an_agent_raises() -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from agents import Listener, Script
 
-from controller.types import Action, ArmAction, CartesianTarget, Hold, Observation, Step
+from controller.types import Action, ArmAction, CartesianTarget, Hold
 from studio import tasks
 from studio.inputs.scripted import ScriptedAgent
 from studio.session import Session
@@ -15,28 +18,6 @@ from studio.twin import Twin
 @pytest.fixture(scope="module", params=tasks.names())
 def twin(request: pytest.FixtureRequest) -> Twin:
     return Twin(tasks.load(request.param))
-
-
-class Still:
-    """Does nothing, for as long as it may."""
-
-    def __init__(self, n_arms: int) -> None:
-        self._action = Action((ArmAction(Hold(), 0.0),) * n_arms)
-
-    def reset(self, observation: Observation) -> None: ...
-
-    def act(self, observation: Observation) -> Action | None:
-        return self._action
-
-
-class Watch:
-    """Remembers what a demonstration asked for, and what the robot made of it."""
-
-    def __init__(self) -> None:
-        self.steps: list[Step] = []
-
-    def on_step(self, step: Step) -> None:
-        self.steps.append(step)
 
 
 def test_a_task_describes_itself(twin: Twin) -> None:
@@ -84,14 +65,14 @@ def test_seeds_draw_different_instances_and_repeat(twin: Twin) -> None:
 
 def test_a_demonstration_succeeds_and_stays_within_the_limits(twin: Twin) -> None:
     twin.reset(0)
-    watch = Watch()
-    ending = Session(twin).run(ScriptedAgent(twin, 0), [watch], time_limit=twin.task.time_limit)
+    listener = Listener()
+    ending = Session(twin).run(ScriptedAgent(twin, 0), [listener], time_limit=twin.task.time_limit)
     assert ending.reason == "finished"
     assert ending.progress.success
-    assert not [limit for step in watch.steps for limit in step.applied.limits]
+    assert not [limit for step in listener.steps for limit in step.applied.limits]
     modes = {
         step.requested.arms[0].target.stiffness.diagonals[0]
-        for step in watch.steps
+        for step in listener.steps
         if isinstance(step.requested.arms[0].target, CartesianTarget)
     }
     assert len(modes) == len(set(twin.task.arms[0].modes))
@@ -111,7 +92,8 @@ def test_the_same_seed_demonstrates_the_same_and_another_seed_another(twin: Twin
 
 def test_doing_nothing_fails(twin: Twin) -> None:
     twin.reset(0)
-    ending = Session(twin).run(Still(len(twin.task.arms)), time_limit=twin.task.time_limit)
+    still = Action((ArmAction(Hold(), 0.0),) * len(twin.task.arms))
+    ending = Session(twin).run(Script(itertools.repeat(still)), time_limit=twin.task.time_limit)
     assert ending.reason == "time limit"
     assert not ending.progress.success
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from agents import Script
 
 from controller.types import (
     Action,
     ArmAction,
-    Observation,
     Pose,
     StiffnessMode,
     multiply_quaternions,
@@ -22,7 +22,7 @@ from studio.api import Studio
 from studio.inputs.scripted import ScriptedAgent
 from studio.motion import Motion
 from studio.replay import ReplayAgent
-from studio.session import Ending, Session, Subscriber
+from studio.session import Ending, Session
 from studio.station import ForceMeter
 from studio.tasks.wiping import BOARD_CENTER, ERASER_HALF, MARK_LENGTH, MARK_OFFSET
 from studio.twin import Twin
@@ -30,22 +30,9 @@ from studio.twin import Twin
 SEEDS = range(200, 220)
 
 
-class Script:
-    """An agent that plays a generator of one arm's actions."""
-
-    def __init__(self, actions: Iterator[ArmAction]) -> None:
-        self._actions = actions
-
-    def reset(self, observation: Observation) -> None: ...
-
-    def act(self, observation: Observation) -> Action | None:
-        action = next(self._actions, None)
-        return None if action is None else Action((action,))
-
-
-def play(twin: Twin, actions: Iterator[ArmAction], meter: Subscriber | None = None) -> Ending:
-    subscribers = [meter] if meter else []
-    return Session(twin).run(Script(actions), subscribers, time_limit=twin.task.time_limit)
+def play(twin: Twin, actions: Iterator[ArmAction]) -> Ending:
+    script = Script(Action((action,)) for action in actions)
+    return Session(twin).run(script, time_limit=twin.task.time_limit)
 
 
 def hand_of(twin: Twin) -> Motion:
