@@ -1,0 +1,177 @@
+"""One person's review of one take: the scene, the timeline, the plots and the pictures at one time.
+
+A thread of its own draws; whatever a person does only says what to draw next. Nothing of it is shared: two
+people review two takes, or the same one, without seeing each other, and the live scene goes on for everybody
+else.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+
+import numpy as np
+import viser
+
+from controller.types import Array, rotation_of
+from studio import tasks
+from studio.cursor import Cursor
+from studio.episode import Episode, open_episode
+from studio.index import EpisodeRow
+from studio.ui import scene
+from studio.ui.playback import Playback
+from studio.ui.review_bar import HEIGHT, ReviewBar
+from studio.ui.scene import SceneModel, SceneView
+from studio.ui.viser_private import show_jpeg
+
+GIZMOS = "/gizmo"  # root of what one drags the live robot by, see `studio.ui.gizmo`
+
+log = logging.getLogger(__name__)
+
+
+class Review:
+    """Opens a take for one client and draws it until closed. Any thread may command it."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        row: EpisodeRow,
+        model: Callable[[str], SceneModel],
+        gallery: viser.GuiFolderHandle,
+        on_failure: Callable[[str], None],
+    ) -> None:
+        """`model` gives the scene of a task. The pictures go into `gallery`."""
+        self.row = row
+        self.playback = Playback(row.duration)
+        self.shown = threading.Event()  # the first time is drawn
+        self._client, self._model, self._gallery = client, model, gallery
+        self._bar: ReviewBar | None = None
+        self._on_failure, self._is_gone = on_failure, False
+        self._thread = threading.Thread(target=self._run, name=f"review of {row.episode_id}", daemon=True)
+        self._thread.start()
+
+    def close(self, *, is_gone: bool = False) -> None:
+        """Take everything off the client's page, unless the client is gone with its page."""
+        self._is_gone = is_gone
+        self.playback.close()
+        self._thread.join()
+
+    def fit(self, width: int) -> None:
+        """The client's view is `width` [px] wide now."""
+        if self._bar is not None:
+            self._bar.fit(width)
+
+    def _run(self) -> None:
+        try:
+            with open_episode(self.row.path) as episode, ExitStack() as undone:
+                parts = self._build(episode, undone)
+                while (at := self.playback.wait()) is not None:
+                    for part in parts:
+                        part.show(at)
+                    self._client.flush()
+                    self.shown.set()
+                if self._is_gone:
+                    undone.pop_all()
+        except Exception as error:  # a damaged take must not take the page down
+            log.exception("The review of %s ended", self.row.episode_id)
+            self._on_failure(f"{self.row.episode_id} cannot be shown: {error}")
+
+    def _build(self, episode: Episode, undone: ExitStack) -> Sequence[_Scene | _Gallery | ReviewBar]:
+        cursor, model = None, None
+        try:
+            name = episode.header.task
+            model = self._model(name)
+            cursor = Cursor(episode, model.mujoco, tasks.load(name))
+        except (AttributeError, KeyError, ValueError) as error:  # the plots are still worth seeing
+            why = str(error.args[0] if error.args else error)
+            self._client.add_notification("No scene for this take", why, color="orange")
+            cursor, model = Cursor(episode), None
+        parts: list[_Scene | _Gallery | ReviewBar] = []
+        if model is not None:
+            view = _Scene(self._client, model, cursor)
+            undone.callback(view.remove)
+            undone.callback(_raise_view(self._client))
+            parts.append(view)
+        gallery = _Gallery(self._client, self._gallery, cursor)
+        undone.callback(gallery.remove)
+        self._bar = ReviewBar(self._client, _title(self.row), cursor, self.playback)
+        undone.callback(self._bar.remove)
+        return [*parts, gallery, self._bar]
+
+
+class _Scene:
+    """The take in 3-D, in place of the live scene."""
+
+    def __init__(self, client: viser.ClientHandle, model: SceneModel, cursor: Cursor) -> None:
+        self._cursor = cursor
+        self._hidden = [scene.hide(client, root) for root in (scene.LIVE, GIZMOS)]
+        self._view = SceneView(client, model, scene.REVIEW)
+        for index, arm in enumerate(cursor.arms):
+            self._view.set_trail(index, arm.path(), arm.force)
+
+    def show(self, at: float) -> None:
+        moment, picture = self._cursor.at(at), self._cursor.picture(at)
+        if picture is not None:
+            self._view.set_ink(picture)
+        assert moment.qpos is not None
+        self._view.update(
+            moment.qpos,
+            [arm.wrench for arm in moment.arms],
+            [arm.base_from_target for arm in moment.arms],
+            [arm.level for arm in moment.arms],
+        )
+
+    def remove(self) -> None:
+        self._view.remove()
+        for hidden in self._hidden:
+            hidden.remove()
+
+
+class _Gallery:
+    """The cameras' pictures, two in a row."""
+
+    def __init__(self, client: viser.ClientHandle, folder: viser.GuiFolderHandle, cursor: Cursor) -> None:
+        self._cursor = cursor
+        self._handles: dict[str, viser.GuiImageHandle] = {}
+        self._shown: dict[str, bytes] = {}
+        self._rest: list[viser.GuiHtmlHandle] = []
+        with folder:
+            for number, camera in enumerate(cursor.jpegs(0.0)):
+                if number % 2 == 0:
+                    self._rest.append(client.gui.add_html('<i class="c2"></i>'))
+                blank = np.zeros((2, 2, 3), np.uint8)
+                self._handles[camera] = client.gui.add_image(
+                    blank, label=camera.replace("_", " "), format="jpeg"
+                )
+
+    def show(self, at: float) -> None:
+        for camera, jpeg in self._cursor.jpegs(at).items():
+            if jpeg != self._shown.get(camera):
+                self._shown[camera] = jpeg
+                show_jpeg(self._handles[camera], jpeg)
+
+    def remove(self) -> None:
+        for handle in (*self._rest, *self._handles.values()):
+            handle.remove()
+
+
+def _raise_view(client: viser.ClientHandle) -> Callable[[], None]:
+    """Shift what the client looks at above the bar; the result shifts it back."""
+    camera = client.camera
+    down = rotation_of(camera.wxyz)[:, 1]
+    distance = float(np.linalg.norm(camera.look_at - camera.position))
+    share = min(HEIGHT / max(camera.image_height, 1), 0.8)
+    shift = share * distance * math.tan(camera.fov / 2) * down
+
+    def move(by: Array) -> None:
+        camera.position = camera.position + by  # takes what it looks at along
+
+    move(shift)
+    return lambda: move(-shift)
+
+
+def _title(row: EpisodeRow) -> str:
+    return row.task if row.seed is None else f"{row.task} {row.seed}"

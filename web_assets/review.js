@@ -1,0 +1,31 @@
+// Keys of a take under review. Runs again after each reconnection.
+//
+// The server writes `<i data-press="ArrowLeft Space">` before a row of buttons: these keys click them, in
+// their order. While such a mark is on the page, keys that drive the robot do nothing in this browser.
+(() => {
+  const style = document.getElementById("review-style") ?? document.head.appendChild(document.createElement("style"));
+  style.id = "review-style";
+  style.textContent = REVIEW_CSS;
+  if (window.reviewPage) return;
+  window.reviewPage = true;
+
+  const CAMERA = /^Key[WASDQE]$/;  // viser moves its camera by them
+  const DRIVES = /^(Key[A-Z]|Digit[0-9])$/;
+
+  addEventListener("keydown", (event) => {
+    const mark = document.querySelector("[data-press]");
+    if (!mark || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target instanceof Element && event.target.closest("input, textarea, select, [contenteditable=true]")) return;
+    const index = mark.dataset.press.split(" ").indexOf(event.code);
+    if (index < 0) {
+      if (DRIVES.test(event.code) && !CAMERA.test(event.code)) event.stopImmediatePropagation();
+      return;
+    }
+    event.stopImmediatePropagation();  // the arrows would turn viser's camera, too
+    event.preventDefault();
+    if (event.repeat && event.code === "Space") return;
+    let element = mark.parentElement;
+    for (let step = 0; step <= index; step++) element = element?.nextElementSibling;
+    element?.querySelector("button:not(:disabled)")?.click();
+  }, true);
+})();
