@@ -1,0 +1,192 @@
+"""The Episodes tab: each client's own list of takes, and the take that it has opened."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from studio.catalog import Catalog
+from studio.index import EpisodeRow
+from studio.ui.review import Review
+from studio.ui.scene import SceneModel
+from studio.ui.take_card import TakeCard
+from studio.ui.take_list import TakeList
+from studio.ui.viser_private import run_javascript
+
+
+class EpisodesTab:
+    """Fills `tab` for every client that is or will be connected."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        tab: viser.GuiTabHandle,
+        catalog: Catalog,
+        *,
+        model: Callable[[str], SceneModel] | None = None,
+        author: Callable[[], str] = getpass.getuser,
+    ) -> None:
+        """`model` gives the scene of a task, best always the same one; `author` is who annotates."""
+        self.catalog, self.author = catalog, author
+        self.model = model or cache(SceneModel)
+        self._tab = tab
+        self._clients: dict[int, ClientEpisodes] = {}
+        run_javascript(server, page_script())
+        server.on_client_connect(self._connect)
+        server.on_client_disconnect(self._disconnect)
+
+    def refresh(self) -> None:
+        """Look for takes, e.g. after one was recorded, and bring every list up to date."""
+        self.catalog.refresh()
+        self.show()
+
+    def show(self) -> None:
+        """Bring every list up to date with the catalogue."""
+        for client in list(self._clients.values()):
+            client.takes.show()
+
+    def of(self, client_id: int) -> ClientEpisodes | None:
+        """What this client sees; None before it has connected and after it has gone."""
+        return self._clients.get(client_id)
+
+    def close(self) -> None:
+        """End every review."""
+        for client in list(self._clients.values()):
+            client.close()
+
+    def _connect(self, client: viser.ClientHandle) -> None:
+        with self._tab:
+            episodes = ClientEpisodes(client, self)
+        self._clients[client.client_id] = episodes
+        self.refresh()
+
+    def _disconnect(self, client: viser.ClientHandle) -> None:
+        gone = self._clients.pop(client.client_id, None)
+        if gone is not None:
+            gone.close()
+
+
+class ClientEpisodes:
+    """One client's list and open take, built into the container that is open; one thing at a time."""
+
+    def __init__(self, client: viser.ClientHandle, everybody: EpisodesTab) -> None:
+        self._client, self._everybody, self._catalog = client, everybody, everybody.catalog
+        self._lock = threading.RLock()
+        self._deleted: str | None = None  # id of the take that can be brought back
+        self.review: Review | None = None
+        gui = client.gui
+        self._list_folder = gui.add_folder(None)
+        with self._list_folder:
+            self.takes = TakeList(
+                gui, self._catalog, open_take=self.open, restore=self._restore, look_again=everybody.refresh
+            )
+        self._card_folder = gui.add_folder(None, visible=False)
+        with self._card_folder:
+            self._card = TakeCard(gui, self)
+        client.camera.on_update(self._fit)
+
+    def open(self, episode_id: str) -> None:
+        """Review a take, instead of the one that is open, if any."""
+        with self._turn():
+            row = self._catalog.get(episode_id)
+            self._leave()
+            self._card.show(row)
+            self._list_folder.visible, self._card_folder.visible = False, True
+            self.review = Review(
+                self._client, row, self._everybody.model, self._card.gallery, self._card.fail
+            )
+
+    def back(self) -> None:
+        """To the list and the live scene."""
+        with self._turn():
+            self._card.save_note()
+            self._leave()
+            self._list_folder.visible, self._card_folder.visible = True, False
+
+    def neighbour(self, steps: int) -> None:
+        """Open the take so many further down the list."""
+        with self._turn():
+            if self.review is not None:
+                episode_id = self.takes.neighbour(self.review.row.episode_id, steps)
+                if episode_id is None:
+                    raise ValueError(f"There is no {'older' if steps > 0 else 'newer'} take in the list.")
+                self._card.save_note()
+                self.open(episode_id)
+
+    def annotate(self, **changes: Any) -> None:
+        """Say something about the open take; `changes` are fields of `studio.edits.Edit`."""
+        with self._turn():
+            if self.review is not None:
+                row = self._catalog.annotate(
+                    self.review.row.episode_id, author=self._everybody.author(), **changes
+                )
+                self._changed(row)
+
+    def undo(self) -> None:
+        """Take back this author's last change of the open take."""
+        with self._turn():
+            if self.review is not None:
+                self._changed(self._catalog.undo(self.review.row.episode_id, author=self._everybody.author()))
+
+    def delete(self) -> None:
+        """Move the open take to the trash; the list offers to bring it back."""
+        with self._turn():
+            if self.review is not None:
+                self._deleted = self._catalog.delete(self.review.row.episode_id).episode_id
+                self._leave()
+                self._list_folder.visible, self._card_folder.visible = True, False
+                self.takes.offer_undo(self._deleted)
+                self._everybody.show()
+
+    def close(self) -> None:
+        """The client has gone."""
+        with self._lock:
+            if self.review is not None:
+                self.review.close(is_gone=True)
+
+    def _restore(self) -> None:
+        with self._turn():
+            if self._deleted is not None:
+                self._catalog.restore(self._deleted)
+                self._deleted = None
+                self.takes.offer_undo(None)
+                self._everybody.show()
+
+    def _changed(self, row: EpisodeRow) -> None:
+        self._card.show(row)
+        self._everybody.show()
+
+    def _fit(self, camera: viser.CameraHandle) -> None:
+        with self._lock:
+            if self.review is not None:
+                self.review.fit(camera.image_width)
+
+    def _leave(self) -> None:
+        if self.review is not None:
+            self.review.close()
+            self.review = None
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """One thing after the other; what does not work is told to the person."""
+        with self._lock:
+            try:
+                yield
+            except (KeyError, ValueError, OSError) as error:
+                why = str(error.args[0]) if error.args else type(error).__name__
+                self._client.add_notification("That did not work", why, color="orange")
+
+
+def page_script() -> str:
+    """What the page needs besides viser's own: keys and looks of a review."""
+    folder = Path(__file__).parents[2] / "web_assets"
+    style = json.dumps((folder / "review.css").read_text())
+    return (folder / "review.js").read_text().replace("REVIEW_CSS", style)
