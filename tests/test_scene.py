@@ -38,7 +38,7 @@ def server() -> Iterator[viser.ViserServer]:
 
 @pytest.fixture
 def viewer(server: viser.ViserServer) -> Iterator[Viewer]:
-    with Viewer(server.get_port()) as viewer:
+    with Viewer(server) as viewer:
         yield viewer
 
 
@@ -123,7 +123,7 @@ def test_who_comes_late_sees_the_present(model: SceneModel, server: viser.ViserS
         data.qpos[:] = some_qpos(model, seed)
         view.update(data.qpos)
     mujoco.mj_kinematics(model.mujoco, data)
-    with Viewer(server.get_port()) as late:
+    with Viewer(server) as late:
         late.settle()
         hand = next(node for node in model.nodes if node.path.endswith("right_wrist_3_link"))
         np.testing.assert_allclose(pose_of(late, LIVE + hand.path).position, data.xpos[hand.body], atol=2e-4)
@@ -289,7 +289,7 @@ def test_a_long_trail_is_thinned(model: SceneModel, server: viser.ViserServer, v
 
 def test_a_review_is_one_person_s(model: SceneModel, server: viser.ViserServer) -> None:
     live = SceneView(server, model, LIVE)
-    with Viewer(server.get_port()) as other, Viewer(server.get_port()) as reviewer:
+    with Viewer(server) as other, Viewer(server) as reviewer:
         for each in (other, reviewer):
             each.settle()
         client = server.get_clients()[1]
@@ -316,7 +316,7 @@ def test_a_review_is_one_person_s(model: SceneModel, server: viser.ViserServer) 
 
 
 def test_two_reviews_are_apart(model: SceneModel, server: viser.ViserServer) -> None:
-    with Viewer(server.get_port()) as first, Viewer(server.get_port()) as second:
+    with Viewer(server) as first, Viewer(server) as second:
         for each in (first, second):
             each.settle()
         clients = server.get_clients()

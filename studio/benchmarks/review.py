@@ -55,7 +55,7 @@ def _measure(task: str, seconds: float) -> dict[str, float]:
         episodes = EpisodesTab(
             server, server.gui.add_tab_group().add_tab("Episodes"), catalog, model=lambda _: model
         )
-        with Viewer(server.get_port()) as viewer:
+        with Viewer(server) as viewer:
             viewer.settle()
             (client,) = (episodes.of(client_id) for client_id in server.get_clients())
             assert client is not None

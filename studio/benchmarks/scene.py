@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from statistics import median, quantiles
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import numpy as np
@@ -22,19 +22,26 @@ from studio import tasks
 from studio.benchmarks import two_arms
 from studio.twin import Twin
 
+if TYPE_CHECKING:
+    import viser
+
 SETTLED = 0.3  # [s] without a byte after which everything has arrived
+MARK = "/mark"  # nodes that only tell how far a viewer has read
 WARM_UP = 30  # updates that are not counted
 
 
 class Viewer:
     """A page's socket without a page: it reads whatever viser sends, counts it and keeps the messages."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, server: viser.ViserServer) -> None:
         self.bytes = 0
         self.messages: list[dict[str, Any]] = []
+        self._server = server
+        self._marks = 0
+        self._seen: set[str] = set()
         self._arrived = time.monotonic()
         self._socket = connect(
-            f"ws://127.0.0.1:{port}",
+            f"ws://127.0.0.1:{server.get_port()}",
             subprotocols=[Subprotocol(f"viser-v{version('viser')}")],
             compression=None,
             max_size=None,
@@ -54,9 +61,12 @@ class Viewer:
         self._thread.join()
 
     def settle(self) -> None:
-        """Wait until nothing more arrives."""
-        self._arrived = time.monotonic()
-        while not self.bytes or time.monotonic() - self._arrived < SETTLED:
+        """Wait until all that was sent has arrived: a mark behind it has, and then nothing more."""
+        self._marks += 1
+        mark = f"{MARK}/{id(self)}/{self._marks}"
+        self._server.scene.add_frame(mark, show_axes=False)
+        self._server.flush()
+        while mark not in self._seen or time.monotonic() - self._arrived < SETTLED:
             time.sleep(0.02)
 
     def _read(self) -> None:
@@ -64,7 +74,12 @@ class Viewer:
             while True:
                 window = self._socket.recv(decode=False)
                 self.bytes += len(window)
-                self.messages += _decode(window)["messages"]
+                for message in _decode(window)["messages"]:
+                    name = str(message.get("name", ""))
+                    if name.startswith(MARK):
+                        self._seen.add(name)
+                    else:
+                        self.messages.append(message)
                 self._arrived = time.monotonic()
         except ConnectionClosed:
             return
@@ -106,7 +121,7 @@ def _measure(task: str, seconds: float) -> dict[str, float]:
     try:
         set_stage(server, model)
         view = SceneView(server, model, LIVE)
-        with Viewer(server.get_port()) as viewer:
+        with Viewer(server) as viewer:
             viewer.settle()
             scene_bytes = viewer.bytes
             _paced(lambda: shows.next(view), WARM_UP, 1 / RATE)
