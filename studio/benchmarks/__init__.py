@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 from studio.recorder import versions
 
-PARTS = ("fdcc", "contact", "loop", "cameras", "episodes")  # modules with a `measure()`
+# Modules with a `measure()`.
+PARTS = ("fdcc", "contact", "loop", "cameras", "episodes", "live", "gizmo", "scene", "proxy", "review")
 
 Results = dict[str, Any]  # what a part measured
 
@@ -86,4 +87,17 @@ GOALS = (
     ),
     Goal("episodes", "columns of 60 s with two arms, CPU [s]", lambda r: r["columns_cpu_s"], "<=", 0.8),
     Goal("episodes", "any image of a take [ms]", lambda r: r["frame_ms"], "<=", 6.0),
+    Goal("live", "ticks more than 2 ms late, share", lambda r: r["late_share"], "<=", 0.005),
+    Goal("scene", "scene of two arms [MB]", lambda r: r["two_arms_scene_MB"], "<=", 3.0),
+    Goal("scene", "poses of one arm, to a viewer [kB/s]", lambda r: r["one_arm_stream_kB_per_s"], "<=", 60.0),
+    Goal(
+        "scene", "poses of two arms, to a viewer [kB/s]", lambda r: r["two_arms_stream_kB_per_s"], "<=", 60.0
+    ),
+    Goal(
+        "gizmo",
+        "isolated move of the gizmo to the servo, p95 [ms]",
+        lambda r: r["isolated_p95_ms"],
+        "<=",
+        40.0,
+    ),
 )

@@ -33,7 +33,8 @@ WARM_UP = 30  # updates that are not counted
 class Viewer:
     """A page's socket without a page: it reads whatever viser sends, counts it and keeps the messages."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, port: int | None = None) -> None:
+        """Through `port` where given, a proxy's, else to the server itself."""
         self.bytes = 0
         self.messages: list[dict[str, Any]] = []
         self._server = server
@@ -41,7 +42,7 @@ class Viewer:
         self._seen: set[str] = set()
         self._arrived = time.monotonic()
         self._socket = connect(
-            f"ws://127.0.0.1:{server.get_port()}",
+            f"ws://127.0.0.1:{port or server.get_port()}",
             subprotocols=[Subprotocol(f"viser-v{version('viser')}")],
             compression=None,
             max_size=None,
