@@ -42,6 +42,7 @@ ABOVE = 0.02  # [m] height at which a press begins
 DEPTH = 0.01  # [m] of the target below the board's face
 SPEED = 0.05  # [m/s] of the target
 PRESSED = 3.0  # [s] that the target stays
+SLOW_PRESSED = 20.0  # [s] likewise, fed with measured joints
 JUDGED = 1.0  # [s] at the end over which a press is judged
 QUIET = 0.1  # [N] standard deviation of a quiet press
 ERROR_SCALES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # tried for the margin, from below
@@ -84,7 +85,9 @@ def measure() -> dict[str, Any]:
         "error_scale": shipped.fdcc.error_scale,
         "press": {mode.value: asdict(press(twin, mode)) for mode in MODES},
         "press_at_twice_error_scale": {mode.value: asdict(press(doubled, mode)) for mode in MODES},
-        "press_with_measured_feedback": {mode.value: asdict(press(measured, mode)) for mode in MODES},
+        "press_with_measured_feedback": {
+            mode.value: asdict(press(measured, mode, stay=SLOW_PRESSED)) for mode in MODES
+        },
         "press_by_joint_control": asdict(press(twin, StiffnessMode.HIGH, by_joints=True)),
         "quiet_up_to_error_scale": quiet_up_to(),
         "step": {mode.value: _on_all_axes(twin, mode, np.eye(3, 6) * STEP) for mode in MODES},
@@ -97,9 +100,14 @@ def twin_with(config: ServoConfig) -> Twin:
 
 
 def press(
-    twin: Twin, mode: StiffnessMode, place: tuple[float, float] = PLACES[0], by_joints: bool = False
+    twin: Twin,
+    mode: StiffnessMode,
+    place: tuple[float, float] = PLACES[0],
+    *,
+    stay: float = PRESSED,
+    by_joints: bool = False,
 ) -> Press:
-    """Approach in free space, then press 10 mm into the board and stay."""
+    """Approach in free space, then press 10 mm into the board and stay there [s]."""
     twin.reset(0)
     start = twin.observe().arms[0].base_from_tcp
     above, inside = (Pose(np.array([*place, BOARD_CENTER[2] + z]), start.wxyz) for z in (ABOVE, -DEPTH))
@@ -109,7 +117,7 @@ def press(
     _run(twin, hand.wait(1.5))
     held = _held(twin)
     actions: Iterator[ArmAction] = itertools.chain(
-        hand.move(inside, (ABOVE + DEPTH) / SPEED, linear=True), hand.wait(PRESSED)
+        hand.move(inside, (ABOVE + DEPTH) / SPEED, linear=True), hand.wait(stay)
     )
     if by_joints:
         actions = _as_joint_targets(twin.arms[0].kinematics, twin.observe().arms[0].q_command, actions)
