@@ -21,7 +21,9 @@ import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
+
+import rich
 
 from studio import tasks
 from studio.api import Studio
@@ -31,8 +33,12 @@ from studio.server import LOOPBACK, PORT, FrontServer, make_app, start_viser
 from studio.ui.app import Page
 from studio.ui.remote import Remote
 
+if TYPE_CHECKING:
+    import viser
+
 LOCK = ".serve.lock"
 START_TIMEOUT = 60.0  # [s] for a session process to answer on a busy machine
+SWITCH_INTERVAL = 0.001  # [s] after which a busy thread lets a hand on the gizmo through
 END_TIMEOUT = 15.0  # [s] for it to keep a take and end
 
 log = logging.getLogger(__name__)
@@ -133,6 +139,7 @@ def serve(
     tasks.load(task)  # an unknown task is refused before anything starts
     data_dir = data_dir.absolute()
     data_dir.mkdir(parents=True, exist_ok=True)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     ended = _on_signals()
     with contextlib.ExitStack() as stack:
         lock = stack.enter_context(_lock(data_dir))
@@ -141,7 +148,7 @@ def serve(
             tell(recovery.what)
         process = SessionProcess(data_dir, task, cameras=cameras)
         viewer = start_viser()
-        stack.callback(viewer.stop)
+        stack.callback(_stop, viewer)
         page = Page(viewer, studio, process)
         stack.callback(page.close)
         app = make_app(
@@ -176,6 +183,15 @@ def health(remote: Remote, process: SessionProcess, n_viewers: int) -> dict[str,
         "cameras": (status.camera_error or "ok") if status and is_alive else None,
         "viewers": n_viewers,
     }
+
+
+def _stop(viewer: viser.ViserServer) -> None:
+    console = rich.get_console()
+    quiet, console.quiet = console.quiet, True  # what it says is not for people
+    try:
+        viewer.stop()
+    finally:
+        console.quiet = quiet
 
 
 def _end_session(remote: Remote, process: SessionProcess) -> None:

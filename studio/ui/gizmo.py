@@ -45,7 +45,7 @@ class Gizmo:
         self._shown = np.zeros(7)  # pose that the browsers have
         self._target = np.zeros(7)
         self._handle = scene.add_transform_controls(
-            f"/gizmo/{setup.name}", scale=SCALE, line_width=4.0, depth_test=False, visible=False
+            f"/live/gizmo/{setup.name}", scale=SCALE, line_width=4.0, depth_test=False, visible=False
         )
 
         @self._handle.on_update
