@@ -47,9 +47,7 @@ LOOPBACK = "127.0.0.1"
 PORT = 8080
 WEB_ASSETS = Path(__file__).parent.parent / "web_assets"
 
-STALL_TIMEOUT = (
-    10.0  # [s] a browser that takes no byte for so long is dropped; viser's page comes back by itself
-)
+STALL_TIMEOUT = 10.0  # [s] a browser that takes no byte for so long is dropped; viser's page reconnects
 UNSENT_LIMIT = 32 * 1024  # [bytes] that may wait in each place: a slow browser gets fewer poses, not old ones
 MESSAGE_LIMIT = 50 * 1024 * 1024  # [bytes] of a browser's message: viser's own limit
 PONG_TIMEOUT = 60.0  # [s] a pong waits behind the scene: 3 MB over 1 Mbit/s take 24 s
@@ -70,7 +68,7 @@ logger = logging.getLogger(__name__)
 
 
 def start_viser(label: str | None = None) -> viser.ViserServer:
-    """viser on a free loopback port (`get_port()`), without the way to make it public."""
+    """viser on a free loopback port (`get_port()`), for our proxy only, without a way to make it public."""
     import viser
     from viser import _messages
 
@@ -85,9 +83,15 @@ def start_viser(label: str | None = None) -> viser.ViserServer:
     server._websock_server.unregister_handler(_messages.ShareUrlRequest)
 
     @server._websock_server.on_client_connect
-    def _(client: viser.infra.WebsockClientConnection) -> None:
+    async def _(client: viser.infra.WebsockClientConnection) -> None:
         connection = server._websock_server._live_connections[client.client_id]
         _limit_unsent(connection.transport.get_extra_info("socket"))
+        # Any web page may find this port. Browsers always name the page, and our proxy leaves that out.
+        if connection.request and "Origin" in connection.request.headers:
+            await connection.close(CloseCode.POLICY_VIOLATION, "Open the studio's own page.")
+            with suppress(ConnectionClosed):
+                async for _ in connection:  # what it sent meanwhile is heard by nobody
+                    pass
 
     return server
 
@@ -151,6 +155,7 @@ class ViserProxy:
         self._authority = f"{LOOPBACK}:{port}"
         # viser closes each connection after its answer, so none is kept, and there is nothing to close.
         limits = httpx.Limits(max_keepalive_connections=0)
+        # verify=False: there is no TLS on loopback, and the certificates would take 0.1 s to load.
         self._client = httpx.AsyncClient(limits=limits, trust_env=False, verify=False)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -163,13 +168,14 @@ class ViserProxy:
             await self._websocket(scope, receive, send)
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
-        request = Request(scope, receive)
-        has_body = {"content-length", "transfer-encoding"} & set(request.headers)
+        request = Request(scope)
+        if request.method not in ("GET", "HEAD"):
+            await _refuse(405, "viser knows only GET.", {"Allow": "GET, HEAD"})(scope, receive, send)
+            return
         passed_on = httpx.Request(
-            request.method,
+            "GET",  # of an answer to HEAD uvicorn sends no body
             f"http://{self._authority}",
             headers=_end_to_end(request.headers.raw),
-            content=request.stream() if has_body else None,
             extensions={"target": _target(scope), "timeout": httpx.Timeout(VISER_TIMEOUT).as_dict()},
         )
         try:
@@ -193,7 +199,7 @@ class ViserProxy:
                 additional_headers=[
                     (name.decode("latin-1"), value.decode("latin-1"))
                     for name, value in _end_to_end(browser.headers.raw)
-                    if not name.startswith(b"sec-websocket-")
+                    if not name.startswith((b"sec-websocket-", b"origin"))
                 ],
                 subprotocols=[Subprotocol(name) for name in scope["subprotocols"]] or None,
                 user_agent_header=None,
@@ -279,9 +285,9 @@ def _bad_gateway(error: Exception) -> ASGIApp:
     return _refuse(502, "The 3-D view does not answer. Reload the page, or restart the studio.")
 
 
-def _refuse(status: int, reason: str) -> ASGIApp:
+def _refuse(status: int, reason: str, headers: Mapping[str, str] | None = None) -> ASGIApp:
     """Answers a request, or the opening of a WebSocket, with a status and a sentence."""
-    response = PlainTextResponse(reason, status)
+    response = PlainTextResponse(reason, status, headers)
 
     async def answer(scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":

@@ -45,32 +45,33 @@ def wait_for(condition: Callable[[], object], seconds: float = 10.0) -> None:
 
 
 class Echo(http.server.BaseHTTPRequestHandler):
-    """Answers with what it was asked: target, headers and body."""
+    """Answers with what it was asked, and with a body that is not what it is said to be."""
+
+    body = os.urandom(1_000_000)
 
     def do_GET(self) -> None:
-        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-        asked = repr((self.command, self.path, sorted(self.headers.items()))).encode()
         self.send_response(418)
         for name, value in {"Set-Cookie": "a=1", "set-cookie": "b=2", "Content-Encoding": "br"}.items():
             self.send_header(name, value)
-        self.send_header("Content-Length", str(len(asked) + 1 + len(body)))
+        self.send_header("Asked", repr((self.path, sorted(self.headers.items()))))
+        self.send_header("Content-Length", str(len(self.body)))
         self.end_headers()
-        self.wfile.write(asked + b"\n" + body)
-
-    do_POST = do_PUT = do_GET
+        self.wfile.write(self.body)
 
     def log_message(self, format: str, *args: object) -> None:
         pass
 
 
 @contextmanager
-def http_upstream() -> Iterator[int]:
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Echo) as server:
+def http_upstream(handler: type[http.server.BaseHTTPRequestHandler] = Echo) -> Iterator[int]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        yield server.server_port
-        server.shutdown()
-        thread.join()
+        try:
+            yield server.server_port
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 @contextmanager
@@ -89,14 +90,32 @@ def websocket_upstream(
     ) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        yield server.socket.getsockname()[1]
-        server.shutdown()
-        thread.join()
+        try:
+            yield server.socket.getsockname()[1]
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def echo(connection: ServerConnection) -> None:
     for message in connection:
         connection.send(message)
+
+
+class Endless(http.server.BaseHTTPRequestHandler):
+    """Answers until nobody listens."""
+
+    ended = threading.Event()
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        with suppress(OSError):
+            while True:
+                self.wfile.write(bytes(64 * 1024))
+        self.ended.set()
+
+    log_message = Echo.log_message
 
 
 class Flood:
@@ -138,7 +157,7 @@ class Page(NamedTuple):
 @pytest.fixture
 def page() -> Iterator[Page]:
     server = start_viser()
-    with front_of(server.get_port(), stall_timeout=1.0) as front:
+    with front_of(server.get_port(), stall_timeout=3.0) as front:
         yield Page(server, front)
     server.stop()
 
@@ -158,20 +177,28 @@ def test_http_passes_byte_for_byte() -> None:
     target = "/a/../b//%2e%2F%c3%a4?x=1&y=%20&z="
     with http_upstream() as port, front_of(port) as front:
         connection = http.client.HTTPConnection("127.0.0.1", front.port)
-        for method, body in (("GET", b""), ("POST", os.urandom(1_000_000)), ("PUT", b"x")):
-            connection.request(method, target, body or None, {"X-Own": "1", "Accept-Encoding": "br"})
+        for method, body in (("GET", Echo.body), ("HEAD", b"")):
+            connection.request(method, target, headers={"X-Own": "1", "Accept-Encoding": "br"})
             answer = connection.getresponse()
-            asked, _, echoed = answer.read().partition(b"\n")
-            assert (answer.status, echoed) == (418, body)
+            assert (answer.status, answer.read()) == (418, body)
             assert answer.headers.get_all("Set-Cookie") == ["a=1", "b=2"]
             assert answer.headers["Content-Encoding"] == "br"
-            command, path, headers = eval(asked)
-            assert (command, path) == (method, target)
-            given = {name.lower(): value for name, value in headers}
-            assert given.pop("host") == f"127.0.0.1:{port}"
-            assert given.pop("content-length", "0") == str(len(body))
-            assert given == {"x-own": "1", "accept-encoding": "br"}
+            assert len(answer.headers.get_all("Date", [])) == 1
+            path, headers = eval(answer.headers["Asked"])
+            assert path == target
+            assert {name.lower(): value for name, value in headers} == {
+                "host": f"127.0.0.1:{port}",
+                "x-own": "1",
+                "accept-encoding": "br",
+            }
         connection.close()
+
+
+def test_viser_is_not_asked_what_it_does_not_know(page: Page, caplog: pytest.LogCaptureFixture) -> None:
+    assert httpx.head(page.front.url).status_code == 200
+    for method in ("POST", "OPTIONS", "BREW"):
+        assert httpx.request(method, page.front.url).status_code == 405
+    assert not [record for record in caplog.records if record.levelno > logging.INFO]
 
 
 def test_messages_pass_byte_for_byte_both_ways() -> None:
@@ -276,6 +303,13 @@ def test_a_target_of_another_host_is_not_followed(alone: FrontServer) -> None:
                 assert raw.makefile("rb").readline().split()[1] == b"400"
 
 
+def test_an_answer_ends_where_the_browser_leaves() -> None:
+    with http_upstream(Endless) as port, front_of(port) as front:
+        with httpx.stream("GET", front.url) as answer:
+            next(answer.iter_raw())
+        assert Endless.ended.wait(10)
+
+
 # Own routes
 
 
@@ -356,7 +390,7 @@ def test_only_our_own_pages_change_things() -> None:
             answer = httpx.request(method, front.url, headers={"Origin": "http://evil.example"})
             assert answer.status_code == 403
             assert "evil.example" in answer.text
-        assert httpx.post(front.url, headers={"Origin": front.url}).status_code == 418
+        assert httpx.post(front.url, headers={"Origin": front.url}).status_code == 405
         assert httpx.get(front.url, headers={"Origin": "http://evil.example"}).status_code == 418
 
 
@@ -383,27 +417,59 @@ def test_no_other_page_may_frame_ours(alone: FrontServer) -> None:
         assert "frame-ancestors 'self'" in httpx.get(alone.url + path).headers["Content-Security-Policy"]
 
 
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1, 0, 0, 0),
+    "position": (0, 0, 1),
+    "look_at": (0, 0, 0),
+    "up_direction": (0, 0, 1),
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 9.0,
+    "image_height": 9,
+    "image_width": 9,
+}
+
+
+def press(button: viser.GuiButtonHandle) -> bytes:
+    """What viser's page sends for a click."""
+    message = {"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}}
+    return msgspec.msgpack.encode(message)
+
+
 def test_a_raw_request_for_the_share_tunnel_does_nothing(page: Page) -> None:
     request = msgspec.msgpack.encode({"type": "ShareUrlRequest"})
     pressed, asked = threading.Event(), threading.Event()
     button = page.viser.gui.add_button("Press")
     button.on_click(lambda _: pressed.set())
-    press = {"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}}
-    camera = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0} | {
-        "near": 0.1, "far": 10.0, "image_height": 9, "image_width": 9,
-        "look_at": [0, 0, 0], "up_direction": [0, 0, 1],
-    }  # fmt: skip
     with open_socket(page.front, subprotocols=[VISER], max_size=None) as browser:
-        browser.send(msgspec.msgpack.encode(camera))
+        browser.send(msgspec.msgpack.encode(CAMERA))
         wait_for(page.viser.get_clients)
         browser.send(request)
-        browser.send(msgspec.msgpack.encode(press))
+        browser.send(press(button))
         assert pressed.wait(10)  # so the request before it was handled
         assert page.viser._share_tunnel is None
         # The request was well formed: where there is a handler, it arrives.
         page.viser._websock_server.register_handler(_messages.ShareUrlRequest, lambda *_: asked.set())
         browser.send(request)
         assert asked.wait(10)
+
+
+def test_a_web_page_that_found_visers_own_port_is_not_heard(page: Page) -> None:
+    heard = threading.Event()
+    page.viser._websock_server.register_handler(_messages.GuiUpdateMessage, lambda *_: heard.set())
+    button = page.viser.gui.add_button("Press")
+    url, origin = f"ws://127.0.0.1:{page.viser.get_port()}", Origin("http://evil.example")
+    with connect(url, proxy=None, origin=origin, subprotocols=[VISER]) as evil:
+        with suppress(ConnectionClosed):
+            for _ in range(5):
+                evil.send(press(button))
+        evil.recv_events_thread.join()
+        assert evil.close_code == 1008
+    assert not heard.wait(0.2)
+    with open_socket(page.front, origin=Origin(page.front.url), subprotocols=[VISER]) as ours:
+        ours.send(press(button))
+        assert heard.wait(10)
 
 
 def test_no_log_line_tells_a_query(caplog: pytest.LogCaptureFixture) -> None:
@@ -442,16 +508,35 @@ def test_a_browser_that_reads_nothing_does_not_disturb_another(
     with open_socket(page.front, subprotocols=[VISER], max_size=None) as browser:
         wait_for(lambda: len(connections) == 2)
         begin, arrivals = time.monotonic(), []
-        while len(connections) == 2 or time.monotonic() < begin + 2:
-            assert time.monotonic() < begin + 20, "the stuck one is not dropped"
+        while len(connections) == 2:
+            assert time.monotonic() < begin + 30, "the stuck one is not dropped"
             points.points = rng.normal(size=(20_000, 3)).astype(np.float32)  # 120 kB as they are sent
             page.viser.flush()
-            browser.recv(timeout=1)
+            browser.recv(timeout=30)
             arrivals.append(time.monotonic())
-    assert len(arrivals) > 30
-    assert max(b - a for a, b in pairwise(arrivals)) < 0.5
+    assert len(arrivals) > 20
+    assert max(b - a for a, b in pairwise(arrivals)) < 2.0  # not the 3 s that the stuck one is waited for
     assert "it took nothing of what was sent to it" in caplog.text
     stuck.socket.close()
+
+
+def test_a_browser_that_paused_gets_the_newest_and_little_else(page: Page) -> None:
+    rng = np.random.default_rng(0)
+    points = page.viser.scene.add_point_cloud("/points", np.zeros((20_000, 3), np.float32), (1, 2, 3))
+    messages: list[bytes] = []
+    with (
+        front_of(page.viser.get_port()) as front,  # more patient than the page's
+        open_socket(front, subprotocols=[VISER], max_size=None, max_queue=1) as browser,
+    ):
+        for _ in range(100):
+            points.points = newest = rng.normal(size=(20_000, 3)).astype(np.float32)
+            page.viser.flush()
+            time.sleep(0.02)
+        with suppress(TimeoutError):
+            while True:
+                messages.append(browser.recv(timeout=1, decode=False))
+    assert messages[-1].endswith(newest.astype(np.float16).tobytes())
+    assert sum(map(len, messages)) < 4_000_000  # 12 MB where the kernel buffers as it likes
 
 
 # Start and stop
