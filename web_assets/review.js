@@ -1,4 +1,4 @@
-// Keys of a take under review. Runs again after each reconnection.
+// Keys and place of the bar of a take under review. Runs again after each reconnection.
 //
 // The server writes `<i data-press="ArrowLeft Space">` before a row of buttons: these keys click them, in
 // their order. While such a mark is on the page, keys that drive the robot do nothing in this browser.
@@ -8,6 +8,14 @@
   style.textContent = REVIEW_CSS;
   if (window.reviewPage) return;
   window.reviewPage = true;
+
+  // Under the scene, between the panels
+  setInterval(() => {
+    if (!document.querySelector(".readout")) return;
+    const view = document.querySelector("canvas").getBoundingClientRect();
+    document.documentElement.style.setProperty("--view-left", `${view.left}px`);
+    document.documentElement.style.setProperty("--view-width", `${view.width}px`);
+  }, 100);
 
   const CAMERA = /^Key[WASDQE]$/;  // viser moves its camera by them
   const DRIVES = /^(Key[A-Z]|Digit[0-9])$/;

@@ -23,7 +23,7 @@ from studio.episode import Episode, open_episode
 from studio.index import EpisodeRow
 from studio.ui import scene
 from studio.ui.playback import Playback
-from studio.ui.review_bar import HEIGHT, ReviewBar
+from studio.ui.review_bar import COVERED, ReviewBar
 from studio.ui.scene import SceneModel, SceneView
 from studio.ui.viser_private import show_jpeg
 
@@ -48,7 +48,6 @@ class Review:
         self.playback = Playback(row.duration)
         self.shown = threading.Event()  # the first time is drawn
         self._client, self._model, self._gallery = client, model, gallery
-        self._bar: ReviewBar | None = None
         self._on_failure, self._is_gone = on_failure, False
         self._thread = threading.Thread(target=self._run, name=f"review of {row.episode_id}", daemon=True)
         self._thread.start()
@@ -58,11 +57,6 @@ class Review:
         self._is_gone = is_gone
         self.playback.close()
         self._thread.join()
-
-    def fit(self, width: int) -> None:
-        """The client's view is `width` [px] wide now."""
-        if self._bar is not None:
-            self._bar.fit(width)
 
     def _run(self) -> None:
         try:
@@ -97,9 +91,9 @@ class Review:
             parts.append(view)
         gallery = _Gallery(self._client, self._gallery, cursor)
         undone.callback(gallery.remove)
-        self._bar = ReviewBar(self._client, _title(self.row), cursor, self.playback)
-        undone.callback(self._bar.remove)
-        return [*parts, gallery, self._bar]
+        bar = ReviewBar(self._client, _title(self.row), cursor, self.playback)
+        undone.callback(bar.remove)
+        return [*parts, gallery, bar]
 
 
 class _Scene:
@@ -163,8 +157,7 @@ def _raise_view(client: viser.ClientHandle) -> Callable[[], None]:
     camera = client.camera
     down = rotation_of(camera.wxyz)[:, 1]
     distance = float(np.linalg.norm(camera.look_at - camera.position))
-    share = min(HEIGHT / max(camera.image_height, 1), 0.8)
-    shift = share * distance * math.tan(camera.fov / 2) * down
+    shift = COVERED * distance * math.tan(camera.fov / 2) * down
 
     def move(by: Array) -> None:
         camera.position = camera.position + by  # takes what it looks at along

@@ -16,10 +16,9 @@ from studio.ui.playback import SETTLE, Playback
 from studio.ui.plots import AXES, AXIS_COLORS
 from studio.ui.teleop import set_value
 
-HEIGHT = 350  # [px] about all of the bar
+COVERED = 0.47  # share of the scene's height that the bar hides, about
 PLOT_HEIGHT, STIFFNESS_HEIGHT, TIMES_HEIGHT = 100, 74, 22  # [px]
 GUTTER, MARGIN = 90, 62  # [px] left and right of every row of the bar; `web_assets/review.css` has them, too
-EDGE, LEAST_WIDTH = 12, 480  # [px] between the bar and the edges of the view; of the bar
 POINTS = 400  # of a plot
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 STIFF = 800.0  # [N/m] up to here the stiffness plot goes at least
@@ -45,14 +44,8 @@ class ReviewBar:
             self._playhead = gui.add_html("")
         strip = timeline.height(cursor.arms, cursor.marks)
         self._height = strip + PLOT_HEIGHT + STIFFNESS_HEIGHT - TIMES_HEIGHT  # [px] of the playhead
-        self._width = 0
-        self.fit(client.camera.image_width)
-
-    def fit(self, width: int) -> None:
-        """Below a view of `width` [px], all across it."""
-        if width != self._width:
-            self._width = width
-            self._panel.float(x=EDGE, y=-EDGE, width=max(width - 2 * EDGE, LEAST_WIDTH))
+        # `web_assets/review.js` puts it below the scene: only the browser knows how wide that is.
+        self._panel.float(x=12, y=-12, width=600)
 
     def show(self, at: float) -> None:
         playback = self._playback
@@ -70,11 +63,11 @@ class ReviewBar:
         playback = self._playback
         # The mark of `web_assets/review.js`: these keys press the next three buttons.
         gui.add_html('<i class="r7" data-press="ArrowLeft Space ArrowRight"></i>')
-        back = gui.add_button("‹ Step", color="dark", hint="Left arrow. One picture back.")
-        self._play = gui.add_button("Play", color="blue", hint="Space")
-        on = gui.add_button("Step ›", color="dark", hint="Right arrow. One picture on.")
+        back = gui.add_button("‹ Step", color="dark")
+        self._play = gui.add_button("Play", color="blue")
+        on = gui.add_button("Step ›", color="dark")
         slower = gui.add_button("Slower", color="dark")
-        self._speed = gui.add_button("1×", color="dark", hint="Back to real time")
+        self._speed = gui.add_button("1×", color="dark")
         faster = gui.add_button("Faster", color="dark")
         back.on_click(lambda _: self._step(-1))
         on.on_click(lambda _: self._step(1))
