@@ -107,11 +107,13 @@ class Cursor:
         """With the `model` of the episode's task there are positions of the whole scene, with a `task` of
         its own the cursor paints what was painted in it.
 
-        Raise ValueError where the episode is of another version of the task.
+        Raise ValueError where the episode is empty, or of another version of the task.
         """
         self.episode = episode
         self.duration = episode.duration
         self.arms = _tracks(episode)
+        if not all(len(arm.time) and len(arm.action_time) for arm in self.arms):
+            raise ValueError(f"{episode.header.episode_id} holds no states: it was cut off as it began.")
         self._limits = episode.limits()
         self._limit_times = np.array([at for at, _ in self._limits])
         self.marks = tuple(

@@ -266,6 +266,13 @@ def test_images_are_the_newest_of_their_time(tmp_path: Path) -> None:
                 assert cursor.jpegs(float(shown))["front"] == episode.jpeg("front", number)
 
 
+def test_a_take_without_states_is_refused(tmp_path: Path) -> None:
+    header = made_up_header()
+    path = EpisodeWriter(tmp_path / "empty.mcap", header).finish(Outcome(None, "nothing happened"))
+    with open_episode(path) as episode, pytest.raises(ValueError, match="holds no states"):
+        Cursor(episode)
+
+
 def test_thinned_curves_keep_their_peaks() -> None:
     values = np.random.default_rng(0).normal(size=5000)
     kept = peaks(values, 300)
