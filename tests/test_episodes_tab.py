@@ -24,6 +24,7 @@ from studio.server import start_viser
 from studio.ui import timeline
 from studio.ui.episodes import ClientEpisodes, EpisodesTab
 from studio.ui.playback import FRAME, SETTLE, Playback
+from studio.ui.review import GIZMOS
 from studio.ui.scene import LIVE, REVIEW, SceneModel, SceneView
 from studio.ui.take_card import facts
 from studio.ui.take_list import PAGE, label, words
@@ -211,9 +212,9 @@ def test_two_people_review_without_seeing_each_other(rig: Rig) -> None:
         assert len(ben.scene) == ben_sees
         assert len(bystander.scene) == bystander_sees
         # The live scene is hidden for those who review, and for nobody else.
-        hidden = [m for m in ana.scene if m["name"] == LIVE and m.get("visible") is False]
-        assert hidden
-        assert not [m for m in bystander.scene if m["name"] == LIVE and m.get("visible") is False]
+        hidden = {m["name"] for m in ana.scene if m.get("visible") is False}
+        assert {LIVE, GIZMOS} <= hidden
+        assert not {LIVE, GIZMOS} & {m["name"] for m in bystander.scene if m.get("visible") is False}
         assert not [m for m in bystander.scene if m["name"].startswith(REVIEW)]
         assert rig.live.visible
 

@@ -37,7 +37,7 @@ class EpisodesTab:
         """`model` gives the scene of a task, best always the same one; `author` is who annotates."""
         self.catalog, self.author = catalog, author
         self.model = model or cache(SceneModel)
-        self._tab = tab
+        self._server, self._tab = server, tab
         self._clients: dict[int, ClientEpisodes] = {}
         run_javascript(server, page_script())
         server.on_client_connect(self._connect)
@@ -66,7 +66,10 @@ class EpisodesTab:
         with self._tab:
             episodes = ClientEpisodes(client, self)
         self._clients[client.client_id] = episodes
+        episodes.takes.show()  # what is known already
         self.refresh()
+        if client.client_id not in self._server.get_clients():  # gone before it could be told to us
+            self._disconnect(client)
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
         gone = self._clients.pop(client.client_id, None)
@@ -91,7 +94,6 @@ class ClientEpisodes:
         self._card_folder = gui.add_folder(None, visible=False)
         with self._card_folder:
             self._card = TakeCard(gui, self)
-        client.camera.on_update(self._fit)
 
     def open(self, episode_id: str) -> None:
         """Review a take, instead of the one that is open, if any."""
@@ -163,11 +165,6 @@ class ClientEpisodes:
     def _changed(self, row: EpisodeRow) -> None:
         self._card.show(row)
         self._everybody.show()
-
-    def _fit(self, camera: viser.CameraHandle) -> None:
-        with self._lock:
-            if self.review is not None:
-                self.review.fit(camera.image_width)
 
     def _leave(self) -> None:
         if self.review is not None:

@@ -14,6 +14,11 @@ from studio.index import EpisodeRow
 from studio.ui.teleop import set_value
 
 UNRATED = "not rated"
+HELP = (
+    '<div class="text dim"><kbd>Space</kbd> plays, <kbd>←</kbd> <kbd>→</kbd> step by a picture. '
+    "Keys that drive the robot rest while a take is open. "
+    "A deleted take goes to the trash; the list can bring it back.</div>"
+)
 COLORS: dict[Outcome, Any] = {"success": "green", "failure": "red", "unmarked": "gray"}
 
 
@@ -38,7 +43,7 @@ class TakeCard:
         self._actions = actions
         self._row: EpisodeRow | None = None
         gui.add_html('<i class="c3"></i>')
-        back = gui.add_button("‹ All takes", color="blue", hint="To the list and the live scene.")
+        back = gui.add_button("‹ All takes", color="blue")
         newer = gui.add_button("Newer", color="dark")
         older = gui.add_button("Older", color="dark")
         self._facts = gui.add_html("")
@@ -51,8 +56,9 @@ class TakeCard:
         self._note = gui.add_text("Note", "", multiline=True, hint="Saved by the button, or when you leave.")
         gui.add_html('<i class="c3"></i>')
         save = gui.add_button("Save note", color="dark")
-        undo = gui.add_button("Undo", color="dark", hint="Take back your last change of this take.")
-        delete = gui.add_button("Delete", color="dark", hint="To the trash; the list can bring it back.")
+        undo = gui.add_button("Undo", color="dark")
+        delete = gui.add_button("Delete", color="dark")
+        gui.add_html(HELP)
         back.on_click(lambda _: actions.back())
         newer.on_click(lambda _: actions.neighbour(-1))
         older.on_click(lambda _: actions.neighbour(1))

@@ -50,7 +50,7 @@ class TakeList:
         gui.add_html('<i class="c3"></i>')
         self._newer = gui.add_button("‹ Newer", color="dark", disabled=True)
         self._older = gui.add_button("Older ›", color="dark", disabled=True)
-        again = gui.add_button("Refresh", color="dark", hint="Look for takes that were recorded meanwhile.")
+        again = gui.add_button("Refresh", color="dark")
         for widget in (self._text, self._task, self._outcome):
             widget.on_update(lambda _: self._turn(-self._page))
         for number, button in enumerate(self._buttons):
