@@ -14,13 +14,14 @@ from visitor import wait_for
 
 from studio import messages as m
 from studio.link import socket_path
+from studio.serve import SessionProcess
 from studio.ui.remote import Remote
 
 URL = re.compile(r"at (http://127\.0\.0\.1:\d+)")
 
 
 class Served:
-    """A `studio serve` on a folder, in a process of its own."""
+    """A `studio serve` on a folder, in a process of its own. A test's `Site` ends what the test leaves."""
 
     def __init__(self, data: Path, *options: str) -> None:
         self.data = data
@@ -59,8 +60,25 @@ class Served:
     def end(self, number: int = signal.SIGTERM) -> int:
         if self.process.poll() is None:
             self.process.send_signal(number)
-        self.process.communicate(timeout=30)  # closes the pipes
+            self.process.communicate(timeout=30)  # closes the pipes
         return self.process.returncode
+
+
+class Site:
+    """A data folder on which servers run."""
+
+    def __init__(self, data: Path) -> None:
+        self.data = data
+        self._all: list[Served] = []
+
+    def serve(self, *options: str, data: Path | None = None) -> Served:
+        self._all.append(Served(data or self.data, *options))
+        return self._all[-1]
+
+    def close(self) -> None:
+        for served in self._all:
+            served.end(signal.SIGKILL)
+        SessionProcess(self.data, "wiping").end()
 
 
 def start_take(data: Path) -> Remote:

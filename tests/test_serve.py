@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from served import Served, start_take
+from served import Site, start_take
 from visitor import wait_for
 
 from studio.api import Studio
@@ -20,10 +20,10 @@ from studio.ui.remote import Remote
 
 
 @pytest.fixture
-def data(tmp_path: Path) -> Iterator[Path]:
-    """A data folder; whatever session still runs on it ends with the test."""
-    yield tmp_path
-    SessionProcess(tmp_path, "wiping").end()
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path)
+    yield site
+    site.close()
 
 
 def alive(pid: int) -> bool:
@@ -32,21 +32,21 @@ def alive(pid: int) -> bool:
 
 
 def test_a_second_server_and_a_busy_port_are_refused_and_the_first_ends_in_order(
-    data: Path, tmp_path_factory: pytest.TempPathFactory
+    site: Site, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    served = Served(data)
+    data, served = site.data, site.serve()
     url = served.url()
     health = served.health(url)
     assert (health["session"], health["phase"], health["take"]) == ("open", "idle", None)
     assert json.loads((data / LOCK).read_text()) == {"pid": served.process.pid, "url": url}
 
-    second = Served(data)
+    second = site.serve()
     _, complaint = second.process.communicate(timeout=30)
     assert second.process.returncode == 1
     assert complaint.strip().splitlines() == [
         f"studio: {data} is served already at {url} (process {served.process.pid})."
     ]
-    other = Served(tmp_path_factory.mktemp("other"), "--port", url.rpartition(":")[2])
+    other = site.serve("--port", url.rpartition(":")[2], data=tmp_path_factory.mktemp("other"))
     _, complaint = other.process.communicate(timeout=30)
     assert other.process.returncode == 1
     assert len(complaint.strip().splitlines()) == 1
@@ -61,15 +61,15 @@ def test_a_second_server_and_a_busy_port_are_refused_and_the_first_ends_in_order
     assert not (data / LOCK).read_text()
 
 
-def test_a_take_goes_on_while_the_web_process_is_killed_and_comes_back(data: Path) -> None:
-    first = Served(data)
+def test_a_take_goes_on_while_the_web_process_is_killed_and_comes_back(site: Site) -> None:
+    first = site.serve()
     health = first.health(first.url())
-    remote = start_take(data)
+    remote = start_take(site.data)
     first.end(signal.SIGKILL)
     status, _ = remote.status.get()
     assert status is not None
     before = status.take_seconds
-    second = Served(data)
+    second = site.serve()
     again = second.health(second.url())
     assert any(f"process {health['session_pid']}" in line for line in second.said)
     assert (again["session_pid"], again["take"]) == (health["session_pid"], status.take_id)
@@ -77,7 +77,8 @@ def test_a_take_goes_on_while_the_web_process_is_killed_and_comes_back(data: Pat
     assert second.end() == 0
 
 
-def test_a_session_killed_while_recording_is_restarted_and_its_take_recovered(data: Path) -> None:
+def test_a_session_killed_while_recording_is_restarted_and_its_take_recovered(site: Site) -> None:
+    data = site.data
     viewer = start_viser()
     process = SessionProcess(data, "wiping", cameras=False)
     with Studio(data) as studio:
@@ -104,8 +105,8 @@ def test_a_session_killed_while_recording_is_restarted_and_its_take_recovered(da
     assert process.find() is None
 
 
-def test_a_session_that_does_not_answer_is_killed_at_the_end(data: Path) -> None:
-    process, remote = SessionProcess(data, "wiping", cameras=False), Remote()
+def test_a_session_that_does_not_answer_is_killed_at_the_end(site: Site) -> None:
+    process, remote = SessionProcess(site.data, "wiping", cameras=False), Remote()
     process.start()
     process.connect(remote)
     pid = process.pid
@@ -116,8 +117,8 @@ def test_a_session_that_does_not_answer_is_killed_at_the_end(data: Path) -> None
     assert not alive(pid)
 
 
-def test_a_session_that_cannot_start_says_why(data: Path) -> None:
-    process = SessionProcess(data, "no-such-task", cameras=False)
+def test_a_session_that_cannot_start_says_why(site: Site) -> None:
+    process = SessionProcess(site.data, "no-such-task", cameras=False)
     process.start()
     with pytest.raises(RuntimeError, match="no-such-task"):
         process.connect(Remote())

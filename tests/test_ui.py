@@ -230,19 +230,19 @@ def gui() -> Iterator[viser.ViserServer]:
 def test_one_look_tells_who_drives_and_how_stiff(rig: Rig) -> None:
     with rig.visitor() as ana:
         ana.html("nobody drives")
-        assert ana.button("Nobody")["label"] == "● Nobody"
+        ana.button("● Nobody")
         ana.click("Gizmo")
         wait_for(lambda: ana.says("drives by gizmo"))
-        assert ana.button("Gizmo")["label"] == "● Gizmo"
+        ana.button("● Gizmo")
         wait_for(lambda: ana.button("Gizmo")["color"] == "blue" != ana.button("Nobody")["color"])
-        assert ana.button("Medium")["label"] == "● Medium 500 N/m"
+        ana.button("● Medium 500 N/m")
         ana.click("Low 250 N/m")
-        wait_for(lambda: ana.button("Low")["label"] == "● Low 250 N/m")
-        assert ana.button("Medium")["color"] == "dark"
-        assert '<span class="chip low">low 250 N/m</span>' in ana.html('class="bar"')
+        ana.button("● Low 250 N/m")
+        wait_for(lambda: ana.button("Medium")["color"] == "dark")
+        ana.html('<span class="chip low">low 250 N/m</span>')
         rig.session.set(arms=(msgspec.structs.replace(ARM, level="limited", why="Too <hard>."),))
         assert "Too &lt;hard&gt;." in ana.html("right limited")
-        assert '<span class="limited">● limited</span>' in ana.html('class="bar"')
+        ana.html('<span class="limited">● limited</span>')
 
 
 def test_keys_do_what_buttons_do_once_however_long_they_are_held(rig: Rig) -> None:
@@ -272,7 +272,7 @@ def test_a_judgement_ends_the_take_and_its_outcome_is_told(rig: Rig) -> None:
         ana.click("Start take")
         wait_for(lambda: not ana.button("Success")["disabled"])
         ana.click("Success")
-        assert "success" in ana.html("Last take")
+        ana.html('Last take <b class="good">success</b>')
         wait_for(lambda: ("Take kept", "Kept.") in ana.notifications)
         # An unknown take cannot be discarded; the page says so and goes on.
         ana.click("Discard last")
@@ -317,13 +317,13 @@ def test_a_session_that_died_is_told_and_restarted_from_the_page(rig: Rig) -> No
         ana.click("Start take")
         ana.html("REC 00:07")
         rig.session.end()
-        assert "The take take-1 is kept; a restart recovers it." in ana.html('class="over"')
+        ana.html("The take take-1 is kept; a restart recovers it.")
         assert rig.page.remote.state == "closed"
         ana.click("Restart session")
         wait_for(lambda: rig.page.remote.state == "open")
-        assert "nobody drives" in ana.html("nobody drives")
+        ana.html("nobody drives")
         wait_for(lambda: ("Note", "A new session process runs.") in ana.notifications)
-        assert not ana.says('class="over"')
+        wait_for(lambda: not ana.says('class="over"'))
 
 
 def test_an_idle_page_costs_little(rig: Rig) -> None:
@@ -474,8 +474,8 @@ def test_a_second_arm_has_rows_and_keys_of_its_own(gui: viser.ViserServer) -> No
     tab.set_task(arms)
     tab.show(msgspec.structs.replace(STATUS, arms=(left, ARM)))
     with Visitor(gui.get_port()) as ana:
-        assert ana.button("High")["label"] == "● High 750 N/m"
-        assert ana.button("Low")["label"] == "Low 250 N/m"
+        ana.button("● High 750 N/m")
+        ana.button("Low 250 N/m")
         tab.set_task(arms[1:])
         wait_for(lambda: ana._find("GuiButtonMessage", "High") is None)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
-from served import Served
+from served import Site
 from visitor import wait_for
 
 from controller.types import Array
@@ -105,13 +105,14 @@ class Operator:
 
 
 @pytest.fixture
-def data(tmp_path: Path) -> Iterator[Path]:
-    yield tmp_path
-    SessionProcess(tmp_path, "wiping").end()
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path)
+    yield site
+    site.close()
 
 
-def test_an_operator_touches_the_board_records_and_gets_over_a_crash(page: Page, data: Path) -> None:
-    served = Served(data)
+def test_an_operator_touches_the_board_records_and_gets_over_a_crash(page: Page, site: Site) -> None:
+    data, served = site.data, site.serve()
     ana = Operator(page, served.url(), data)
     ana.says("Your first take in three steps")
 
