@@ -470,6 +470,7 @@ def test_a_second_arm_has_rows_and_keys_of_its_own(gui: viser.ViserServer) -> No
     keys = Hotkeys(gui.gui, desk).set_arms(("left", "right"))
     assert {key.name for key in keys} >= {"M", "Shift+M", "G", "Shift+G", "P", "Shift+P", "T", "R"}
     assert len({key.name for key in keys}) == len(keys)
+    assert {key.label for key in keys if key.name == "M"} == {"Switch the right arm's stiffness"}
     left = msgspec.structs.replace(ARM, name="left", modes=("medium", "high"), mode="high")
     tab.set_task(arms)
     tab.show(msgspec.structs.replace(STATUS, arms=(left, ARM)))

@@ -61,13 +61,13 @@ class Hotkeys:
             self._register(hotkey)
 
     def set_arms(self, names: tuple[str, ...]) -> list[Hotkey]:
-        """One set per arm: plain for the first, with Shift for the second."""
+        """One set per arm, see `is_shifted`."""
         for command in self._of_arms:
             command.remove()
         desk = self._desk
         keys = []
-        for arm, name in enumerate(names[:2]):
-            shift = arm == 1
+        for arm, name in enumerate(names):
+            shift = is_shifted(arm, len(names))
             keys += [
                 Hotkey("M", f"Switch the {name} arm's stiffness", partial(desk.switch_mode, arm), shift),
                 Hotkey("G", f"Open or close the {name} gripper", partial(desk.toggle_gripper, arm), shift),
@@ -92,6 +92,11 @@ class Hotkeys:
                 hotkey.action()
 
         return command
+
+
+def is_shifted(arm: int, n_arms: int) -> bool:
+    """Keys of the right arm, always the last, are plain; those of a left one go with Shift."""
+    return arm < n_arms - 1
 
 
 def table(keys: list[Hotkey]) -> str:
@@ -130,7 +135,7 @@ class Keypad:
     def build(self, gui: viser.GuiApi) -> None:
         self._folder = gui.add_folder(None, visible=False)
         with self._folder:
-            self._arm = gui.add_button("", color="dark", visible=False, hint="T. Drive the other arm.")
+            self._arm = gui.add_button("", color="dark", visible=False)
             for row in range(0, len(_KEYS), 3):
                 codes = " ".join(code for code, _, _ in _KEYS[row : row + 3])
                 gui.add_html(f'<i class="c3" data-hold="{codes}"></i>')

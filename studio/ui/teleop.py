@@ -13,7 +13,7 @@ from studio import tasks
 from studio.messages import ArmStatus, Status
 from studio.tasks import ArmSetup
 from studio.ui.desk import CHOICES, Choice, Desk
-from studio.ui.keys import Keypad
+from studio.ui.keys import Keypad, is_shifted
 from studio.ui.status import clock, mode_words
 
 ACTIVE: Final = "blue"
@@ -43,7 +43,9 @@ class TeleopTab:
         for rows in self._arms:
             rows.remove()
         with self._container:
-            self._arms = [_ArmRows(self._gui, self._desk, index, setup) for index, setup in enumerate(arms)]
+            self._arms = [
+                _ArmRows(self._gui, self._desk, index, setup, len(arms)) for index, setup in enumerate(arms)
+            ]
 
     def show(self, status: Status) -> None:
         self._scene.show(status)
@@ -63,8 +65,8 @@ class _SceneRows:
         )
         self._resets = -1
         _columns(gui, 2)
-        again = gui.add_button("Reset scene", color=PASSIVE, icon=viser.Icon.REFRESH)
-        following = gui.add_button("Next seed", color=PASSIVE, icon=viser.Icon.PLAYER_TRACK_NEXT)
+        again = gui.add_button("Reset (B)", color=PASSIVE, icon=viser.Icon.REFRESH)
+        following = gui.add_button("Next seed (V)", color=PASSIVE, icon=viser.Icon.PLAYER_TRACK_NEXT)
 
         @self._task.on_update
         def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
@@ -89,10 +91,7 @@ class _DriverRows:
         self._desk, self._keypad = desk, keypad
         name = gui.add_text("Operator", desk.operator, hint="Your name, kept with each take.")
         _columns(gui, 4)
-        self._buttons = {
-            choice: gui.add_button(LABELS[choice], color=PASSIVE, hint=f"Key {index % len(CHOICES)}")
-            for index, choice in enumerate(CHOICES, start=1)
-        }
+        self._buttons = {choice: gui.add_button(LABELS[choice], color=PASSIVE) for choice in CHOICES}
         self._hint = gui.add_html("")
         keypad.build(gui)
 
@@ -113,7 +112,7 @@ class _DriverRows:
 
 _DRIVER_HINTS: dict[Choice, str] = {
     "gizmo": "Drag the arrows at the tool; left alone it stays.",
-    "keyboard": "Hold a key or button; directions follow your view.",
+    "keyboard": "Hold a key; directions follow your view.",
     "script": "The task's own demonstration runs.",
     "nobody": "The arms hold. Choosing who drives moves nothing.",
 }
@@ -122,26 +121,28 @@ _DRIVER_HINTS: dict[Choice, str] = {
 class _ArmRows:
     """One arm: stiffness, gripper, parking."""
 
-    def __init__(self, gui: viser.GuiApi, desk: Desk, arm: int, setup: ArmSetup) -> None:
+    def __init__(self, gui: viser.GuiApi, desk: Desk, arm: int, setup: ArmSetup, n_arms: int) -> None:
         self._resets = -1
         self._desk, self._arm = desk, arm
         self._rest = 0.0 if setup.grasp else setup.gripper
         self._folder = gui.add_folder(f"{setup.name.capitalize()} arm")
-        key = "Shift+" if arm == 1 else ""
+        self._shift = "⇧" if is_shifted(arm, n_arms) else ""
         with self._folder:
             _columns(gui, 2)
             self._modes = {
-                mode.value: gui.add_button(mode.value, color=PASSIVE, hint=f"{key}M switches")
+                mode.value: gui.add_button(mode.value, color=PASSIVE)
                 for mode in sorted(setup.modes, key=lambda mode: ("low", "medium", "high").index(mode.value))
             }
             self._gripper = gui.add_slider(
-                "Gripper", 0.0, 1.0, 0.01, self._rest, hint=f"0 closed, 1 open. {key}G opens or closes."
+                "Gripper", 0.0, 1.0, 0.01, self._rest, hint=f"0 closed, 1 open; {self._shift}G switches."
             )
-            _columns(gui, 2)
-            self._park = gui.add_button("Park", color=PASSIVE, hint=f"{key}P. A parked arm holds.")
-            release = gui.add_button(
-                "Let go", color=PASSIVE, hint="F. Every arm stops pressing and waits to be engaged."
-            )
+            is_last = arm == n_arms - 1
+            if is_last:
+                _columns(gui, 2)
+            self._park = gui.add_button("Park", color=PASSIVE)
+            if is_last:
+                release = gui.add_button("Let go (F)" if n_arms == 1 else "Let go, both (F)", color=PASSIVE)
+                on_click(release, desk.release)
 
         for mode, button in self._modes.items():
             on_click(button, partial(desk.set_mode, arm, mode))
@@ -155,8 +156,6 @@ class _ArmRows:
         def _(_: object) -> None:
             desk.toggle_engaged(arm)
 
-        on_click(release, desk.release)
-
     def show(self, arm: ArmStatus, status: Status) -> None:
         for mode, button in self._modes.items():
             _set_active(button, _sentence(mode_words(mode)), mode == arm.mode)
@@ -164,7 +163,7 @@ class _ArmRows:
             self._resets = status.resets
             self._desk.grippers[self._arm] = self._rest
         set_value(self._gripper, self._desk.grippers[self._arm])
-        self._park.label = "Park" if arm.engaged else "Engage"
+        self._park.label = f"{'Park' if arm.engaged else 'Engage'} ({self._shift}P)"
         self._park.color = PASSIVE if arm.engaged else ACTIVE
         self._park.disabled = status.driver != "operator"
 
@@ -178,12 +177,12 @@ class _TakeRows:
         self._state = gui.add_html("")
         self._start = gui.add_button("Start take", color="red", icon=viser.Icon.PLAYER_RECORD)
         _columns(gui, 3)
-        self._success = gui.add_button("Success", color="green", hint="Y. Stop and keep as a success.")
-        self._failure = gui.add_button("Failure", color=PASSIVE, hint="N. Stop and keep as a failure.")
-        self._discard = gui.add_button("Discard", color=PASSIVE, hint="X. The take goes to the trash.")
+        self._success = gui.add_button("Success (Y)", color="green")
+        self._failure = gui.add_button("Failure (N)", color=PASSIVE)
+        self._discard = gui.add_button("Discard (X)", color=PASSIVE)
         self._last = gui.add_html("")
         self._undo = gui.add_button(
-            "Undo discard", color=ACTIVE, icon=viser.Icon.ARROW_BACK_UP, visible=False
+            "Undo discard (Z)", color=ACTIVE, icon=viser.Icon.ARROW_BACK_UP, visible=False
         )
         _columns(gui, 2)
         countdown = gui.add_number(
@@ -218,7 +217,7 @@ class _TakeRows:
         is_recording = status.phase == "recording"
         self._success.disabled = self._failure.disabled = not is_recording
         self._discard.disabled = not is_recording and (last is None or is_gone)
-        self._discard.label = "Discard" if is_recording or last is None else "Discard last"
+        self._discard.label = "Discard (X)" if is_recording or last is None else "Discard last (X)"
         self._undo.visible = is_gone
         self._last.content = last_take(status, is_gone)
 
