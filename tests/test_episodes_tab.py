@@ -24,10 +24,12 @@ from studio.server import start_viser
 from studio.ui import timeline
 from studio.ui.episodes import ClientEpisodes, EpisodesTab
 from studio.ui.playback import FRAME, SETTLE, Playback
-from studio.ui.review import GIZMOS
 from studio.ui.scene import LIVE, REVIEW, SceneModel, SceneView
 from studio.ui.take_card import facts
 from studio.ui.take_list import PAGE, label, words
+
+# A client may leave while something is being sent to it; viser warns that this is never delivered.
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a:UserWarning")
 
 EVIL = "<img src=x onerror=alert(1)>"
 
@@ -213,8 +215,8 @@ def test_two_people_review_without_seeing_each_other(rig: Rig) -> None:
         assert len(bystander.scene) == bystander_sees
         # The live scene is hidden for those who review, and for nobody else.
         hidden = {m["name"] for m in ana.scene if m.get("visible") is False}
-        assert {LIVE, GIZMOS} <= hidden
-        assert not {LIVE, GIZMOS} & {m["name"] for m in bystander.scene if m.get("visible") is False}
+        assert LIVE in hidden
+        assert LIVE not in {m["name"] for m in bystander.scene if m.get("visible") is False}
         assert not [m for m in bystander.scene if m["name"].startswith(REVIEW)]
         assert rig.live.visible
 

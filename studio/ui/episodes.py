@@ -6,7 +6,7 @@ import getpass
 import json
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ class EpisodesTab:
         """`model` gives the scene of a task, best always the same one; `author` is who annotates."""
         self.catalog, self.author = catalog, author
         self.model = model or cache(SceneModel)
-        self._server, self._tab = server, tab
+        self.server, self._tab = server, tab
         self._clients: dict[int, ClientEpisodes] = {}
         run_javascript(server, page_script())
         server.on_client_connect(self._connect)
@@ -50,8 +50,11 @@ class EpisodesTab:
 
     def show(self) -> None:
         """Bring every list up to date with the catalogue."""
-        for client in list(self._clients.values()):
-            client.takes.show()
+        for client_id in self.server.get_clients():
+            client = self._clients.get(client_id)
+            if client is not None:
+                with suppress(RuntimeError):  # it has gone meanwhile, and its widgets with it
+                    client.takes.show()
 
     def of(self, client_id: int) -> ClientEpisodes | None:
         """What this client sees; None before it has connected and after it has gone."""
@@ -66,9 +69,9 @@ class EpisodesTab:
         with self._tab:
             episodes = ClientEpisodes(client, self)
         self._clients[client.client_id] = episodes
-        episodes.takes.show()  # what is known already
+        self.show()  # what is known already
         self.refresh()
-        if client.client_id not in self._server.get_clients():  # gone before it could be told to us
+        if client.client_id not in self.server.get_clients():  # gone before it could be told to us
             self._disconnect(client)
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
@@ -103,7 +106,12 @@ class ClientEpisodes:
             self._card.show(row)
             self._list_folder.visible, self._card_folder.visible = False, True
             self.review = Review(
-                self._client, row, self._everybody.model, self._card.gallery, self._card.fail
+                self._everybody.server,
+                self._client,
+                row,
+                self._everybody.model,
+                self._card.gallery,
+                self._card.fail,
             )
 
     def back(self) -> None:
@@ -151,8 +159,7 @@ class ClientEpisodes:
     def close(self) -> None:
         """The client has gone."""
         with self._lock:
-            if self.review is not None:
-                self.review.close(is_gone=True)
+            self._leave()
 
     def _restore(self) -> None:
         with self._turn():

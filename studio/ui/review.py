@@ -27,8 +27,6 @@ from studio.ui.review_bar import COVERED, ReviewBar
 from studio.ui.scene import SceneModel, SceneView
 from studio.ui.viser_private import show_jpeg
 
-GIZMOS = "/gizmo"  # root of what one drags the live robot by, see `studio.ui.gizmo`
-
 log = logging.getLogger(__name__)
 
 
@@ -37,6 +35,7 @@ class Review:
 
     def __init__(
         self,
+        server: viser.ViserServer,
         client: viser.ClientHandle,
         row: EpisodeRow,
         model: Callable[[str], SceneModel],
@@ -47,31 +46,38 @@ class Review:
         self.row = row
         self.playback = Playback(row.duration)
         self.shown = threading.Event()  # the first time is drawn
-        self._client, self._model, self._gallery = client, model, gallery
-        self._on_failure, self._is_gone = on_failure, False
+        self._server, self._client = server, client
+        self._model, self._gallery, self._on_failure = model, gallery, on_failure
         self._thread = threading.Thread(target=self._run, name=f"review of {row.episode_id}", daemon=True)
         self._thread.start()
 
-    def close(self, *, is_gone: bool = False) -> None:
-        """Take everything off the client's page, unless the client is gone with its page."""
-        self._is_gone = is_gone
+    def close(self) -> None:
+        """Take everything off the client's page."""
         self.playback.close()
         self._thread.join()
 
     def _run(self) -> None:
         try:
             with open_episode(self.row.path) as episode, ExitStack() as undone:
-                parts = self._build(episode, undone)
-                while (at := self.playback.wait()) is not None:
-                    for part in parts:
-                        part.show(at)
-                    self._client.flush()
-                    self.shown.set()
-                if self._is_gone:
-                    undone.pop_all()
+                try:
+                    self._draw(self._build(episode, undone))
+                finally:
+                    if not self._is_client_there():  # its page has gone with all that was on it
+                        undone.pop_all()
         except Exception as error:  # a damaged take must not take the page down
-            log.exception("The review of %s ended", self.row.episode_id)
-            self._on_failure(f"{self.row.episode_id} cannot be shown: {error}")
+            if self._is_client_there():
+                log.exception("The review of %s ended", self.row.episode_id)
+                self._on_failure(f"{self.row.episode_id} cannot be shown: {error}")
+
+    def _draw(self, parts: Sequence[_Scene | _Gallery | ReviewBar]) -> None:
+        while (at := self.playback.wait()) is not None:
+            for part in parts:
+                part.show(at)
+            self._client.flush()
+            self.shown.set()
+
+    def _is_client_there(self) -> bool:
+        return self._client.client_id in self._server.get_clients()
 
     def _build(self, episode: Episode, undone: ExitStack) -> Sequence[_Scene | _Gallery | ReviewBar]:
         cursor, model = None, None
@@ -101,7 +107,7 @@ class _Scene:
 
     def __init__(self, client: viser.ClientHandle, model: SceneModel, cursor: Cursor) -> None:
         self._cursor = cursor
-        self._hidden = [scene.hide(client, root) for root in (scene.LIVE, GIZMOS)]
+        self._live = scene.hide(client)  # and the gizmos, which are part of it
         self._view = SceneView(client, model, scene.REVIEW)
         for index, arm in enumerate(cursor.arms):
             self._view.set_trail(index, arm.path(), arm.force)
@@ -120,8 +126,7 @@ class _Scene:
 
     def remove(self) -> None:
         self._view.remove()
-        for hidden in self._hidden:
-            hidden.remove()
+        self._live.remove()
 
 
 class _Gallery:

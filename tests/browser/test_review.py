@@ -25,7 +25,11 @@ from studio.ui.episodes import EpisodesTab
 from studio.ui.review import Review
 from studio.ui.scene import SceneModel, SceneView
 
-pytestmark = pytest.mark.browser
+pytestmark = [
+    pytest.mark.browser,
+    # A page may close while something is being sent to it; viser warns that this is never delivered.
+    pytest.mark.filterwarnings("ignore:Queued a:UserWarning"),
+]
 
 
 class Rig:
