@@ -50,6 +50,7 @@ def _measure(task: str, seconds: float) -> dict[str, float]:
 
     with tempfile.TemporaryDirectory() as folder, Catalog(Path(folder)) as catalog:
         _write(Path(folder), task, seconds)
+        catalog.refresh()
         server, model = start_viser(), SceneModel(task)
         SceneView(server, model, LIVE)
         episodes = EpisodesTab(
