@@ -22,8 +22,7 @@ FORBIDDEN = {
 ONLY_IN = {
     "torch": ("policy/",),
     "mcap": ("studio/episode.py", "studio/mcap_file.py"),
-    "small_mcap": ("studio/episode.py", "studio/mcap_file.py"),
-    "viser": ("studio/ui/",),
+    "viser": ("studio/ui/", "studio/server.py"),
     "rerun": ("studio/export/rrd.py",),
     "openvr": ("studio/inputs/xr.py",),
     "ray": ("studio/jobs.py",),
