@@ -93,7 +93,7 @@ class Twin:
         mujoco.mj_resetData(self.model, self.data)
         starts = self.task.start_poses(rng, spread)
         for arm, world_from_start in zip(self.arms, starts, strict=True):
-            arm.place(world_from_start)
+            arm.place(world_from_start, rng, spread)
         mujoco.mj_forward(self.model, self.data)
         for arm in self.arms:
             arm.present_part(True)
@@ -237,7 +237,8 @@ class _Arm:
         tcp, flange = model.site(f"{name}_tcp").id, model.site(f"{name}_flange").id
         self._tcp_position, self._tcp_matrix = data.site_xpos[tcp], data.site_xmat[tcp]
         self._flange_position, self._flange_matrix = data.site_xpos[flange], data.site_xmat[flange]
-        self._pads = [model.geom(f"{name}_hand_{pad}").id for pad in models.PADS]
+        self._gripping = _gripping_geoms(model, setup)
+        self._friction = model.geom_friction[self._gripping].copy()
         self._data = data
         self._model = model
         # [s] how far the servo's target is put ahead of the command, per joint
@@ -250,7 +251,7 @@ class _Arm:
         self._wrench = np.zeros(6)  # external, tared, about the TCP, base axes
         self._payload = _weight_of_hand(model, name) + _weight_of(setup.grasp)
 
-    def place(self, world_from_tcp: Pose) -> None:
+    def place(self, world_from_tcp: Pose, rng: np.random.Generator, spread: float) -> None:
         """Put the arm at rest with its TCP at a pose, and the part it holds into the open hand."""
         q = self._solve(world_from_tcp, self._home)
         gripper = 0.0 if self.setup.grasp else self.setup.gripper
@@ -260,8 +261,11 @@ class _Arm:
         self._hand[:] = models.GRIPPER_RANGE * (1.0 - gripper)
         if (grasp := self.setup.grasp) is not None:
             world_from_flange = world_from_tcp @ self.setup.flange_from_tcp.inverse()
+            flange_from_body = grasp.draw(rng, spread)
             part = self._model.joint(grasp.body).qposadr[0]
-            self._data.qpos[part : part + 7] = (world_from_flange @ grasp.flange_from_body).vector
+            self._data.qpos[part : part + 7] = (world_from_flange @ flange_from_body).vector
+            presented = self._model.equality(f"{self.setup.name}_presented").id
+            self._model.eq_data[presented, 3:10] = flange_from_body.vector
 
     def present_part(self, fixed: bool) -> None:
         """Fix the held part to the flange while the hand closes, or leave it to the fingers.
@@ -270,7 +274,7 @@ class _Arm:
         """
         if self.setup.grasp is not None:
             self._data.eq_active[self._model.equality(f"{self.setup.name}_presented").id] = fixed
-            self._model.geom_friction[self._pads] = 1e-3 if fixed else models.PAD_FRICTION
+            self._model.geom_friction[self._gripping] = 1e-3 if fixed else self._friction
 
     def tare(self) -> None:
         """Take what the sensor reads now, the part's weight apart, as its zero."""
@@ -346,11 +350,22 @@ class _Arm:
 
 def _towards(setup: ArmSetup) -> Array:
     """Joints (6,) from which the search for home starts: the arm turned towards where its hand will be."""
+    if setup.near is not None:
+        return setup.near
     world_from_flange = setup.world_from_home @ setup.flange_from_tcp.inverse()
     x, y, _ = world_from_flange.position - setup.base_position
     start = HOME_Q.copy()
     start[0] += math.atan2(y, x)
     return start
+
+
+def _gripping_geoms(model: mujoco.MjModel, setup: ArmSetup) -> list[int]:
+    """Ids of the finger pads and of the held part's geoms."""
+    pads = [model.geom(f"{setup.name}_hand_{pad}").id for pad in models.PADS]
+    if setup.grasp is None:
+        return pads
+    part = model.body(setup.grasp.body)
+    return [*pads, *range(int(part.geomadr[0]), int(part.geomadr[0] + part.geomnum[0]))]
 
 
 def _weight(mass: float, center: Array) -> Array:

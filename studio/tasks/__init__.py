@@ -16,7 +16,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from controller.types import Action, Array, Pose, StiffnessMode
+from controller.types import Action, Array, Pose, StiffnessMode, quaternion_from_rotation_vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,17 @@ class Grasp:
     flange_from_body: Pose
     mass: float  # [kg] payload whose weight the F/T sensor compensates
     center: Array  # (3,) [m] centre of mass in the body's frame
+    # How differently the part may lie in the hand at each reset, uniformly. Flat pads leave these two free.
+    offset: float = 0.0  # [m] along the body's y
+    tilt: float = 0.0  # [rad] about the body's x
+
+    def draw(self, rng: np.random.Generator, spread: float) -> Pose:
+        """flange_from_body at a reset."""
+        if self.offset == 0.0 and self.tilt == 0.0:
+            return self.flange_from_body
+        offset, tilt = rng.uniform(-1.0, 1.0, 2) * np.array([self.offset, self.tilt]) * spread
+        turn = quaternion_from_rotation_vector(np.array([tilt, 0.0, 0.0]))
+        return self.flange_from_body @ Pose(np.array([0.0, offset, 0.0]), turn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +52,9 @@ class ArmSetup:
     workspace: tuple[Array, Array]  # lower and upper corner for the target [m], in the world
     grasp: Grasp | None = None
     gripper: float = 1.0  # opening at the start where nothing is held
+    near: Array | None = (
+        None  # (6,) [rad] joints near home, where an elbow up and a hand in front is not meant
+    )
 
 
 @dataclass(frozen=True, slots=True)
