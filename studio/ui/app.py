@@ -86,17 +86,8 @@ class Page:
     def restart_session(self) -> None:
         """Start a new session process, on a thread of its own: recovering a take may take a while."""
 
-        def run() -> None:
-            with self._restarting:
-                if self.remote.state == "open" and self._status is not None and self._status.phase != "idle":
-                    return self._desk.tell("A take is running; stop it first.")
-                try:
-                    self._start_again()
-                except (OSError, RuntimeError) as error:
-                    self._desk.tell(str(error))
-
-        if not self._restarting.locked():
-            threading.Thread(target=run, name="restart", daemon=True).start()
+        if self._restarting.acquire(blocking=False):  # else somebody else is at it
+            threading.Thread(target=self._restart_once, name="restart", daemon=True).start()
 
     # Building
 
@@ -227,6 +218,17 @@ class Page:
         self._keys.content = table(keys)
 
     # Restarting
+
+    def _restart_once(self) -> None:
+        try:
+            if self.remote.state == "open" and self._status is not None and self._status.phase != "idle":
+                self._desk.tell("A take is running; stop it first.")
+            else:
+                self._start_again()
+        except (OSError, RuntimeError) as error:
+            self._desk.tell(str(error))
+        finally:
+            self._restarting.release()
 
     def _start_again(self) -> None:
         status = self._status
