@@ -85,7 +85,6 @@ class Page:
 
     def restart_session(self) -> None:
         """Start a new session process, on a thread of its own: recovering a take may take a while."""
-
         if self._restarting.acquire(blocking=False):  # else somebody else is at it
             threading.Thread(target=self._restart_once, name="restart", daemon=True).start()
 
