@@ -288,15 +288,14 @@ def _spans(times: Array, labels: Array, end: float) -> tuple[Span, ...]:
     """Equal labels joined, those that last less than SHORTEST with the one before."""
     if not len(times):
         return ()
-    starts = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist()]
-    edges = [*times[starts].tolist(), end]
-    spans: list[Span] = []
-    for number, (start, stop) in zip(starts, itertools.pairwise(edges), strict=True):
-        if spans and (stop - start < SHORTEST or labels[number] == spans[-1].label):
-            spans[-1] = replace(spans[-1], end=stop)
-        else:
-            spans.append(Span(start, stop, str(labels[number])))
-    return tuple(spans)
+    first = np.concatenate(([0], np.flatnonzero(labels[1:] != labels[:-1]) + 1))  # samples of new labels
+    starts: list[float] = []
+    told: list[str] = []
+    for start, stop, label in zip(times[first], [*times[first[1:]], end], labels[first], strict=True):
+        if not told or (stop - start >= SHORTEST and label != told[-1]):
+            starts.append(float(start))
+            told.append(str(label))
+    return tuple(Span(*span) for span in zip(starts, [*starts[1:], end], told, strict=True))
 
 
 def _switches(arms: Sequence[ArmTrack]) -> Iterator[Mark]:

@@ -61,11 +61,12 @@ def _measure(task: str, seconds: float) -> dict[str, float]:
             (client,) = (episodes.of(client_id) for client_id in server.get_clients())
             assert client is not None
             (row,) = catalog.episodes()
-            opened, read = [], []
+            opened, busy, read = [], [], []
             with _heartbeat() as waits_opening:
                 for _ in range(N_OPENED):
-                    before = viewer.bytes
+                    before, used = viewer.bytes, time.process_time()
                     opened.append(_timed(lambda: _open(client, row.episode_id)))
+                    busy.append(time.process_time() - used)
                     viewer.settle()
                     read.append(viewer.bytes - before)
             with _heartbeat() as waits_scrubbing:
@@ -75,6 +76,7 @@ def _measure(task: str, seconds: float) -> dict[str, float]:
         return {
             "open_s": median(opened),
             "open_s_worst": max(opened),
+            "open_cpu_s": median(busy),
             "open_MB": median(read) / 1e6,
             "open_wait_ms": max(waits_opening) * 1e3,
             "scrub_ms": median(steps) * 1e3,
