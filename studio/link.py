@@ -11,6 +11,8 @@ import contextlib
 import getpass
 import hashlib
 import logging
+import os
+import socket
 import tempfile
 import threading
 import time
@@ -160,7 +162,7 @@ class Hub:
             box = self._clients.pop(connection, None)
         if box:
             box.close()
-            connection.close()
+            _hang_up(connection)
 
 
 class Link:
@@ -189,7 +191,7 @@ class Link:
     def close(self) -> None:
         self._on_close = lambda: None
         self.is_open = False
-        self._connection.close()
+        _hang_up(self._connection)
 
     def _read(self) -> None:
         with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: closed while reading
@@ -214,3 +216,11 @@ def connect(
             if time.monotonic() > deadline:
                 raise TimeoutError(f"The session process did not answer within {timeout:.0f} s.") from error
             time.sleep(0.05)
+
+
+def _hang_up(connection: Connection) -> None:
+    """Close a connection at which a thread may be waiting: only a shutdown wakes it, here and there."""
+    with contextlib.suppress(OSError):
+        with socket.socket(fileno=os.dup(connection.fileno())) as end:
+            end.shutdown(socket.SHUT_RDWR)
+        connection.close()

@@ -94,7 +94,7 @@ class EndTake(Message, frozen=True, kw_only=True):
 
 
 class DiscardTake(Message, frozen=True, kw_only=True):
-    """Move the running take, or else the last one, to the trash."""
+    """Move the running take to the trash, or call off the countdown."""
 
 
 class Collect(Message, frozen=True, kw_only=True):
