@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Page
 
 from controller.types import Array
 from studio.board import Board
-from studio.server import start_viser
+from studio.server import FrontServer, make_app, start_viser
 from studio.tasks.wiping import BOARD_CENTER
 from studio.ui.scene import LIVE, REVIEW, SceneModel, SceneView, hide, set_stage
 
@@ -22,6 +22,7 @@ PATIENCE = 60.0  # [s] for the browser to draw what it was sent
 ABOVE_BOARD = (0.5, 0.0, 0.75)
 LOOKING_DOWN = (0.0, 1.0, 0.0, 0.0)
 FIELD_OF_VIEW = 0.45  # [rad] vertically: the board's 28 cm fill most of the picture
+FRONTS: dict[int, str] = {}  # URL of the front server before each viser port
 PIXEL = 2 * (ABOVE_BOARD[2] - BOARD_CENTER[2]) * np.tan(FIELD_OF_VIEW / 2) / SIZE[0]  # [m] on the board
 
 
@@ -35,7 +36,9 @@ def server(model: SceneModel) -> Iterator[viser.ViserServer]:
     server = start_viser()
     server.gui.configure_theme(dark_mode=True)
     set_stage(server, model)
-    yield server
+    with FrontServer(make_app(server.get_port()), port=0) as front:  # viser itself answers no browser
+        FRONTS[server.get_port()] = front.url
+        yield server
     server.stop()
 
 
@@ -49,7 +52,7 @@ def upright(model: SceneModel) -> Array:
 def open_page(page: Page, server: viser.ViserServer) -> viser.ClientHandle:
     known = set(server.get_clients())
     page.set_viewport_size({"width": 480, "height": 270})  # each pixel costs the processor
-    page.goto(f"http://127.0.0.1:{server.get_port()}/?fixedDpr=0.5")
+    page.goto(f"{FRONTS[server.get_port()]}/?fixedDpr=0.5")
     deadline = time.monotonic() + PATIENCE
     while not (new := set(server.get_clients()) - known):
         assert time.monotonic() < deadline, "The page never connected."
