@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import getpass
 import importlib.metadata
 import importlib.util
 import json
@@ -50,6 +51,10 @@ _LIBRARIES = """
 import os
 os.environ["MUJOCO_GL"] = "disable"
 import cv2, mujoco, pinocchio
+"""
+_REALTIME = """
+import os
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
 """
 _GPU = """
 import torch
@@ -190,6 +195,23 @@ def check_cores() -> Finding:
     return Finding("cores", n_cores >= CORES, f"{n_cores} usable", "camera images beside a live session")
 
 
+def check_realtime() -> Finding:
+    try:
+        _python(_REALTIME)
+    except subprocess.SubprocessError as error:
+        limit = (
+            f"echo '{getpass.getuser()} - rtprio 20' | sudo tee /etc/security/limits.d/compact-studio.conf"
+        )
+        return Finding(
+            "real time",
+            False,
+            _reason(error),
+            "a loop that is never late beside other work (log in again)",
+            limit,
+        )
+    return Finding("real time", True, "the loop may run before everything else", "a loop that is never late")
+
+
 CHECKS: tuple[Callable[[], Finding], ...] = (
     check_python,
     check_packages,
@@ -201,6 +223,7 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     check_gpu,
     check_disk,
     check_cores,
+    check_realtime,
 )
 
 

@@ -46,6 +46,7 @@ SHOWN = 0.7  # [s] that a limit stays on display
 HELD_SUCCESS = 0.5  # [s] for which success must hold before collecting ends a take
 BETWEEN_TAKES = 1.5  # [s] that a kept take is shown before the next reset, while collecting
 ORPHAN_TIME = 60.0  # [s] without any client
+REALTIME_PRIORITY = 10  # of 99: below what the kernel's own threads use
 SWITCH_INTERVAL = 0.0005  # [s] after which another thread must hand the interpreter back to the loop
 
 log = logging.getLogger(__name__)
@@ -402,14 +403,28 @@ def main(data: Path, task: str = "wiping", seed: int = 0, cameras: bool = True) 
         try:
             session = LiveSession(data.absolute(), task, hub, seed=seed, cameras=cameras)
             _end_on_signal(lambda: hub.commands.post(m.Shutdown()))
-            with contextlib.suppress(PermissionError):
-                os.nice(-5)  # before cameras, page and jobs, where the user may
+            _claim_priority()
             gc.collect()
             gc.freeze()
             session.run()
         finally:
             hub.close()
             path.unlink(missing_ok=True)
+
+
+def _claim_priority() -> None:
+    """Let the loop run before cameras, page and jobs, where the user may.
+
+    The calling thread gets a real-time policy, so that it runs the moment its deadline comes; with a higher
+    priority alone it waits until the time slice of whoever has the core is over. Nothing that it starts later
+    inherits the policy.
+    """
+    with contextlib.suppress(PermissionError):
+        os.nice(-5)
+    if hasattr(os, "SCHED_RESET_ON_FORK"):  # Linux
+        with contextlib.suppress(PermissionError):
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(0, policy, os.sched_param(REALTIME_PRIORITY))
 
 
 def _end_on_signal(end: Callable[[], None]) -> None:

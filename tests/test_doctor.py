@@ -21,7 +21,8 @@ def findings() -> dict[str, Finding]:
 
 def test_everything_is_looked_at(findings: dict[str, Finding]) -> None:
     assert list(findings) == [
-        "Python", "packages", "libraries", "rendering", "chromium", "node", "SteamVR", "GPU", "disk", "cores",
+        "Python", "packages", "libraries", "rendering", "chromium",
+        "node", "SteamVR", "GPU", "disk", "cores", "real time",
     ]  # fmt: skip
     assert findings["Python"].ok
     assert sys.executable in findings["Python"].detail

@@ -289,3 +289,20 @@ def test_a_second_session_on_one_folder_is_refused(stage: Stage) -> None:
     assert second.wait(30) != 0
     assert stage.process.poll() is None
     stage.reset(seed=stage.status.seed + 1)  # the first one still listens
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="Linux has real-time policies")
+def test_the_loop_alone_runs_at_real_time_priority_where_the_user_may(stage: Stage) -> None:
+    policies = {
+        int(task.name): os.sched_getscheduler(int(task.name))
+        for task in Path(f"/proc/{stage.process.pid}/task").iterdir()
+    }
+    loop = policies.pop(stage.process.pid)
+    assert loop in {os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER}
+    assert (loop == os.SCHED_OTHER) != may_run_in_real_time()
+    assert set(policies.values()) == {os.SCHED_OTHER}
+
+
+def may_run_in_real_time() -> bool:
+    probe = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))"
+    return subprocess.run([sys.executable, "-c", probe], stderr=subprocess.DEVNULL).returncode == 0
