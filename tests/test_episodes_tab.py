@@ -398,6 +398,23 @@ def drawn(playback: Playback, clock: Hand, seconds: float) -> list[float]:
     return times
 
 
+def test_no_move_of_the_playhead_is_lost_when_keys_come_at_once() -> None:
+    playback = Playback(1000.0)
+    together = threading.Barrier(8)
+
+    def press() -> None:
+        together.wait()
+        for _ in range(100):
+            playback.move(lambda at: at + 0.125)
+
+    threads = [threading.Thread(target=press) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert playback.time == 100.0
+
+
 def test_playback_runs_at_its_speed_and_stops_at_the_end() -> None:
     clock = Hand()
     playback = Playback(2.0, now=clock)

@@ -39,11 +39,20 @@ class Playback:
             self.is_playing = False
             self._draw_now()
 
+    def toggle(self) -> None:
+        """Play or pause, whichever it is not doing."""
+        with self._changed:
+            (self.pause if self.is_playing else self.play)()
+
     def scrub(self, time: float) -> None:
         """Go to a time and stay there."""
+        self.move(lambda _: time)
+
+    def move(self, next_time: Callable[[float], float]) -> None:
+        """Go to what follows from the time shown, and stay there; of two moves at once none is lost."""
         with self._changed:
             self.is_playing = False
-            self.time = min(max(time, 0.0), self.duration)
+            self.time = min(max(next_time(self.time), 0.0), self.duration)
             self._draw_now()
 
     def set_speed(self, speed: float) -> None:

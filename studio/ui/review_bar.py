@@ -71,7 +71,7 @@ class ReviewBar:
         faster = gui.add_button("Faster", color="dark")
         back.on_click(lambda _: self._step(-1))
         on.on_click(lambda _: self._step(1))
-        self._play.on_click(lambda _: playback.pause() if playback.is_playing else playback.play())
+        self._play.on_click(lambda _: playback.toggle())
         slower.on_click(lambda _: playback.set_speed(_next_speed(playback.speed, -1)))
         faster.on_click(lambda _: playback.set_speed(_next_speed(playback.speed, 1)))
         self._speed.on_click(lambda _: playback.set_speed(1.0))
@@ -161,7 +161,7 @@ class ReviewBar:
         self._key.content = timeline.key(what, "N" if what.startswith("Force") else "N·m", colors)
 
     def _step(self, steps: int) -> None:
-        self._playback.scrub(self._cursor.stepped(self._playback.time, steps))
+        self._playback.move(lambda at: self._cursor.stepped(at, steps))
 
 
 def _next_speed(speed: float, steps: int) -> float:
