@@ -19,6 +19,8 @@
 
   const CAMERA = /^Key[WASDQE]$/;  // viser moves its camera by them
   const DRIVES = /^(Key[A-Z]|Digit[0-9])$/;
+  const GAP = 60;  // [ms] viser forgets a click that comes within 50 after another
+  let free = 0;  // when the next click will count
 
   addEventListener("keydown", (event) => {
     const mark = document.querySelector("[data-press]");
@@ -31,9 +33,15 @@
     }
     event.stopImmediatePropagation();  // the arrows would turn viser's camera, too
     event.preventDefault();
-    if (event.repeat && event.code === "Space") return;
-    let element = mark.parentElement;
+    const now = performance.now();
+    if (event.repeat && (event.code === "Space" || free > now)) return;
+    setTimeout(() => press(index), free - now);
+    free = Math.max(free, now) + GAP;
+  }, true);
+
+  function press(index) {
+    let element = document.querySelector("[data-press]")?.parentElement;
     for (let step = 0; step <= index; step++) element = element?.nextElementSibling;
     element?.querySelector("button:not(:disabled)")?.click();
-  }, true);
+  }
 })();
