@@ -24,7 +24,7 @@ from pathlib import Path
 import msgspec
 
 from studio.channels import Mailbox
-from studio.messages import Command, Message, Report, decode_command, decode_report, encode
+from studio.messages import Command, Message, Notice, Report, decode_command, decode_report, encode
 
 MAX_QUEUE = 1000  # reports that may wait for a client before it is dropped
 
@@ -148,7 +148,14 @@ class Hub:
                     self.commands.post(decode_command(connection.recv_bytes()))
                 except msgspec.DecodeError as error:
                     log.warning("A malformed command was refused: %s", error)
+                    self._answer(connection, Notice(kind="error", text=f"A command was refused: {error}."))
         self._drop(connection)
+
+    def _answer(self, connection: Connection, report: Report) -> None:
+        with self._lock:
+            box = self._clients.get(connection)
+        if box:
+            box.tell(encode(report))
 
     def _write(self, connection: Connection, box: Outbox) -> None:
         with contextlib.suppress(OSError):

@@ -127,8 +127,7 @@ class LiveSession:
         now = time.monotonic()
         if self._alone_since is None:
             self._alone_since = now
-            if self._driver == "operator":  # nobody holds the other end of the arm
-                self._set_driver("nobody", self._operator)
+            self._let_hold()
         elif now - self._alone_since > ORPHAN_TIME:
             log.warning("No client for %.0f s; the session ends.", ORPHAN_TIME)
             self._ended = True
@@ -160,6 +159,8 @@ class LiveSession:
                 self._hand(command.arm).gripper = command.opening
             case m.Release():
                 self._release()
+            case m.OperatorLeft():
+                self._let_hold()
             case m.Drive():
                 self._set_driver(command.driver, command.operator)
             case m.Reset():
@@ -173,6 +174,10 @@ class LiveSession:
                 self._takes.discard()
             case m.Collect():
                 self._start_collecting(command)
+            case m.TakeTrashed():
+                self._takes.collection.trashed(command.episode_id)
+            case m.TakeRestored():
+                self._takes.collection.restored(command.episode_id)
             case m.RestartCameras():
                 self._restart_cameras()
             case m.Shutdown():
@@ -200,8 +205,16 @@ class LiveSession:
         for hand in self._hands.hands:
             hand.release()
 
+    def _let_hold(self) -> None:
+        """Nobody is at the other end of the arms. A script needs nobody."""
+        if self._driver not in ("nobody", "script"):
+            self._set_driver("nobody", self._operator)
+
     def _set_driver(self, driver: m.Driver, operator: str) -> None:
         self._driver, self._operator = driver, operator
+        if self._agent is not self._hands:  # the grippers, too, stay as they are
+            for hand, robot in zip(self._hands.hands, self._robot.arms, strict=True):
+                hand.gripper = robot.servo.gripper
         for arm, hand in enumerate(self._hands.hands):
             if driver == "operator":
                 hand.engage(self._robot.arms[arm].servo.target)

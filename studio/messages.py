@@ -1,15 +1,16 @@
 """What the session process and its clients say to each other: commands in, frames and notices out.
 
 Each message is one msgspec struct, tagged by its name, so that a malformed one is refused where it arrives.
-Arrays travel as little-endian float64 bytes.
+Arrays travel as little-endian float64 bytes. Numbers have bounds, which keep out NaN and infinity, too.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from controller.types import Array
 
@@ -17,6 +18,15 @@ Driver = Literal["nobody", "operator", "script"]
 Level = Literal["ok", "limited", "refused"]  # of the last target: passed, cut back, not followed
 Phase = Literal["idle", "countdown", "recording"]
 Judgement = Literal["success", "failure", "unmarked"]
+
+ArmIndex = Annotated[int, Meta(ge=0, le=7)]
+Metres = Annotated[float, Meta(ge=-10.0, le=10.0)]
+Radians = Annotated[float, Meta(ge=-7.0, le=7.0)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Component = Annotated[float, Meta(ge=-1.01, le=1.01)]  # of a unit quaternion
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Countdown = Annotated[float, Meta(ge=0.0, le=600.0)]  # [s]
+Name = Annotated[str, Meta(max_length=200)]
 
 
 class Message(msgspec.Struct, frozen=True, tag=True, kw_only=True):
@@ -33,58 +43,62 @@ NoticeKind = Literal[
 class Reset(Message, frozen=True, kw_only=True):
     """Draw the instance `seed` of a task; another task is loaded where `task` is given."""
 
-    seed: int
-    task: str | None = None
-    spread: float = 1.0
+    seed: Seed
+    task: Name | None = None
+    spread: Annotated[float, Meta(ge=0.0, le=100.0)] = 1.0
 
 
 class Drive(Message, frozen=True, kw_only=True):
     """Let someone drive, or nobody: the arms then hold."""
 
     driver: Driver
-    operator: str = ""  # the person's name
+    operator: Name = ""  # the person's name
 
 
 class Engage(Message, frozen=True, kw_only=True):
     """Connect an arm to the operator's targets, or park it. Engaging never moves it."""
 
-    arm: int
+    arm: ArmIndex
     engaged: bool
 
 
 class MoveTo(Message, frozen=True, kw_only=True):
     """The operator's target for an arm, base axes. Newest wins."""
 
-    arm: int
-    position: tuple[float, float, float]  # [m]
-    wxyz: tuple[float, float, float, float]
+    arm: ArmIndex
+    position: tuple[Metres, Metres, Metres]  # [m]
+    wxyz: tuple[Component, Component, Component, Component]
 
 
 class Nudge(Message, frozen=True, kw_only=True):
     """Move an arm's target by a step: translation in base axes [m], rotation vector in tool axes [rad]."""
 
-    arm: int
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    arm: ArmIndex
+    translation: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    rotation: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
 
 
 class SetMode(Message, frozen=True, kw_only=True):
-    arm: int
+    arm: ArmIndex
     mode: Literal["low", "medium", "high"]
 
 
 class SetGripper(Message, frozen=True, kw_only=True):
-    arm: int
-    opening: float  # 0 closed .. 1 open
+    arm: ArmIndex
+    opening: Share  # 0 closed .. 1 open
 
 
 class Release(Message, frozen=True, kw_only=True):
     """Let every arm's target run to where the arm is: stop pressing, now."""
 
 
+class OperatorLeft(Message, frozen=True, kw_only=True):
+    """Nobody's hand is at the arms any more: they hold. A script goes on by itself."""
+
+
 class StartTake(Message, frozen=True, kw_only=True):
-    countdown: float = 3.0  # [s] before recording
-    operator: str = ""
+    countdown: Countdown = 3.0  # [s] before recording
+    operator: Name = ""
 
 
 class EndTake(Message, frozen=True, kw_only=True):
@@ -100,10 +114,22 @@ class DiscardTake(Message, frozen=True, kw_only=True):
 class Collect(Message, frozen=True, kw_only=True):
     """Record takes of consecutive seeds until `count` are kept; 0 stops collecting."""
 
-    count: int
-    seed: int = 0
-    countdown: float = 3.0
-    operator: str = ""
+    count: Annotated[int, Meta(ge=0, le=100_000)]
+    seed: Seed = 0
+    countdown: Countdown = 3.0
+    operator: Name = ""
+
+
+class TakeTrashed(Message, frozen=True, kw_only=True):
+    """A kept take was thrown away. Where it was being collected, its seed comes once more."""
+
+    episode_id: Name
+
+
+class TakeRestored(Message, frozen=True, kw_only=True):
+    """A take came back from the trash; it counts again where it was being collected."""
+
+    episode_id: Name
 
 
 class RestartCameras(Message, frozen=True, kw_only=True):
@@ -123,10 +149,13 @@ Command = (
     | SetMode
     | SetGripper
     | Release
+    | OperatorLeft
     | StartTake
     | EndTake
     | DiscardTake
     | Collect
+    | TakeTrashed
+    | TakeRestored
     | RestartCameras
     | Shutdown
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from studio.episode import Header, Outcome
@@ -104,7 +104,7 @@ class Takes:
         path = take.finish(Outcome(success, f"{reason}: {progress.phase}", progress.value))
         outcome: Judgement = "unmarked" if success is None else "success" if success else "failure"
         self.last = self._status_of(take, str(path), outcome, discarded=False)
-        self.collection.kept(time.monotonic())
+        self.collection.kept(take.header.episode_id, take.header.seed, time.monotonic())
         self._tell("take kept", f"Kept as {outcome}: {take.header.episode_id}.", self.last)
 
     def discard(self) -> None:
@@ -175,27 +175,43 @@ class Collection:
     """How far collecting is: which seed comes next, and when."""
 
     count: int = 0  # takes to keep; 0 while not collecting
-    done: int = 0
-    seed: int = 0  # of the next take
     countdown: float = 3.0  # [s]
+    _next: int = 0  # the lowest seed that was not on the stage yet
+    _seeds: dict[str, int | None] = field(default_factory=dict)  # of the kept takes, by their ids
+    _again: dict[str, int | None] = field(default_factory=dict)  # of those that were thrown away since
     _due: float = 0.0  # [s] monotonic time of the next reset
 
     @property
     def is_running(self) -> bool:
         return self.count > 0
 
+    @property
+    def done(self) -> int:
+        """How many takes are kept."""
+        return len(self._seeds)
+
+    @property
+    def seed(self) -> int:
+        """Of the next take: first those whose takes were thrown away."""
+        return min((seed for seed in self._again.values() if seed is not None), default=self._next)
+
     def start(self, count: int, seed: int, countdown: float) -> None:
-        self.count, self.done, self.seed, self.countdown, self._due = count, 0, seed, countdown, 0.0
+        self.count, self.countdown, self._next, self._due = count, countdown, seed, 0.0
+        self._seeds, self._again = {}, {}
 
     def stop(self) -> None:
         self.count = 0
 
-    def kept(self, now: float) -> None:
-        """A take was kept: on to the next seed, or done."""
+    def kept(self, episode_id: str, seed: int | None, now: float) -> None:
+        """A take of `seed` was kept: on to the next one, or done."""
         if not self.is_running:
             return
-        self.done += 1
-        self.seed += 1
+        self._seeds[episode_id] = seed
+        if seed == self._next:
+            self._next += 1
+        repeated = next((old for old, again in self._again.items() if again == seed), None)
+        if repeated is not None:
+            del self._again[repeated]
         self._due = now + BETWEEN_TAKES
         if self.done >= self.count:
             self.stop()
@@ -203,6 +219,16 @@ class Collection:
     def again(self, now: float) -> None:
         """A take was discarded: the same seed once more."""
         self._due = now + BETWEEN_TAKES
+
+    def trashed(self, episode_id: str) -> None:
+        """A kept take was thrown away: it does not count, and its seed comes once more."""
+        if self.is_running and episode_id in self._seeds:
+            self._again[episode_id] = self._seeds.pop(episode_id)
+
+    def restored(self, episode_id: str) -> None:
+        """It is back, before its seed came once more."""
+        if self.is_running and episode_id in self._again:
+            self._seeds[episode_id] = self._again.pop(episode_id)
 
     def is_due(self, now: float) -> bool:
         return now >= self._due

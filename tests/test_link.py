@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Client
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from studio import link
@@ -109,3 +110,26 @@ def test_the_client_hears_when_the_session_is_gone(hub: Hub, tmp_path: Path) -> 
 def test_connecting_to_nobody_says_so(tmp_path: Path) -> None:
     with pytest.raises(TimeoutError, match="did not answer"):
         link.connect(tmp_path / "nobody.sock", lambda report: None, timeout=0.2)
+
+
+def test_a_malformed_command_is_answered_and_goes_no_further(hub: Hub, tmp_path: Path) -> None:
+    got: list[m.Report] = []
+    client = Link(tmp_path / "s.sock", got.append)
+    bad = [
+        {"type": "MoveTo", "arm": 0, "position": [float("nan"), 0.0, 0.0], "wxyz": [1.0, 0.0, 0.0, 0.0]},
+        {"type": "MoveTo", "arm": 0, "position": [0.0, 0.0, float("inf")], "wxyz": [1.0, 0.0, 0.0, 0.0]},
+        {"type": "MoveTo", "arm": 0, "position": [0.0, 0.0], "wxyz": [1.0, 0.0, 0.0, 0.0]},
+        {"type": "SetGripper", "arm": 0, "opening": 1.5},
+        {"type": "Drive", "driver": "operator", "operator": "x" * 10_000},
+        {"type": "Reset", "seed": -1},
+        {"type": "Nonsense"},
+        [1, 2, 3],
+    ]
+    for command in bad:
+        client._connection.send_bytes(msgspec.msgpack.encode(command))
+    client._connection.send_bytes(b"\xc1")
+    client.send(m.Release())
+    wait_for(lambda: len(got) == len(bad) + 1)
+    assert all(isinstance(report, m.Notice) and report.kind == "error" for report in got)
+    wait_for(lambda: hub.commands.drain() == [m.Release()])
+    client.close()
