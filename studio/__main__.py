@@ -115,6 +115,67 @@ def demo(
     return int(bool(report.errors))
 
 
+def evaluate(
+    agent: Positional[Annotated[str, arg(metavar="AGENT")]],
+    task: str | None = None,
+    episodes: int = 20,
+    seed: int = 1000,
+    seeds: str | None = None,
+    compare: str | None = None,
+    data: Data = DATA,
+    workers: int = 1,
+    cameras: bool = False,
+    spread: float = 1.0,
+    json: Json = False,
+) -> int:
+    """Roll out an agent over many seeds; every rollout is an episode.
+
+    Args:
+        agent: demonstrator, nothing, average, replay, all-low, all-high, off-compliant or off-joint.
+        task: What it does.
+        episodes: How many; their seeds are seed, seed + 1, …
+        seed: Of the first episode.
+        seeds: Instead of these two, e.g. 1000:1020 (the last excluded) or 3,5,8.
+        compare: An evaluation, or an agent whose newest one is meant, on the same scenes.
+        workers: Processes that roll out side by side.
+        cameras: Record images although the agent needs none.
+        spread: Above 1 widens the task's randomisation.
+    """
+    from studio.api import Studio
+    from studio.evaluate import Plan
+    from studio.evaluation import compare as compared
+
+    plan = Plan(agent, task or "", _seeds(seeds, seed, episodes), spread=spread, cameras=cameras)
+    with Studio(data) as studio:
+        other = studio.evaluation(compare, plan.task) if compare else None
+        with _progress(f"{plan.run} on {plan.task}", len(plan.seeds), quiet=json) as advance:
+            found = studio.evaluate(plan, workers=workers, on_rollout=lambda rollout: advance())
+    comparison = compared(found, other) if other else None
+    if json:
+        paired = {"comparison": dataclasses.asdict(comparison)} if comparison else {}
+        _print_json(found.summary() | paired)
+    else:
+        console.print(str(found))
+        for rollout in found.rollouts:
+            if rollout.error is not None:
+                console.print(f"  error: seed {rollout.seed}: {rollout.error}", style="yellow")
+        if comparison:
+            console.print(str(comparison))
+    return int(any(rollout.error is not None for rollout in found.rollouts))
+
+
+def _seeds(text: str | None, first: int, count: int) -> tuple[int, ...]:
+    """From 1000:1020 or 3,5,8; else `count` seeds from `first` on."""
+    try:
+        if text is None:
+            return tuple(range(first, first + count))
+        if ":" in text:
+            return tuple(range(*map(int, text.split(":", 1))))
+        return tuple(map(int, text.split(",")))
+    except ValueError:
+        raise ValueError(f"Seeds are told like 1000:1020 or 3,5,8, not {text!r}.") from None
+
+
 def episodes(
     task: str | None = None,
     operator: str | None = None,
@@ -338,6 +399,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "tasks": show_tasks,
     "doctor": doctor,
     "demo": demo,
+    "evaluate": evaluate,
     "episodes": episodes,
     "show": show,
     "annotate": annotate,

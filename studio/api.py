@@ -15,6 +15,8 @@ from studio import replay as replays
 from studio import tasks
 from studio.catalog import Catalog, Refreshed
 from studio.episode import Episode, Recovery, open_episode, recover_all
+from studio.evaluate import Plan, evaluate
+from studio.evaluation import Evaluation, Rollout, find
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
 from studio.session import Agent
@@ -108,6 +110,27 @@ class Studio:
                 make_agent, agent_name=agent_name, seed=seed, spread=spread, operator=operator
             )
         return self.catalog.add(take.path)
+
+    def evaluate(
+        self, plan: Plan, *, workers: int = 1, on_rollout: Callable[[Rollout], None] = lambda rollout: None
+    ) -> Evaluation:
+        """Roll out an agent over many seeds; every rollout is an episode, the evaluation a file beside them.
+
+        More than one worker means processes, as for `demo`.
+        """
+
+        def index(rollout: Rollout, path: Path | None) -> None:
+            if path is not None:
+                self.catalog.add(path)
+            on_rollout(rollout)
+
+        evaluation = evaluate(plan, self.data_dir, workers=workers, on_rollout=index)
+        self.catalog.refresh()  # also what a failed rollout has left
+        return evaluation
+
+    def evaluation(self, name: str, task: str | None = None) -> Evaluation:
+        """By path, by id, or the newest of an agent."""
+        return find(self.data_dir, name, task)
 
     # Takes
 

@@ -82,6 +82,7 @@ class Header:
     world_from_base: tuple[tuple[float, ...], ...] = ()  # per arm: position [m], wxyz; () where not known
     versions: Mapping[str, str] = field(default_factory=dict)  # of code, libraries, machine
     control: Mapping[str, Any] = field(default_factory=dict)  # rates, servo and FDCC parameters, modes
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # of a policy: run, step, how it was run
     wrench_frame: str = "about the TCP, in base axes"
     wrench_sign: str = "what the environment exerts on the robot"
     wrench_tare: str = "weight behind the sensor compensated, zero taken in free space at reset"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import getpass
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -91,10 +92,15 @@ class Station:
         spread: float = 1.0,
         operator: str | None = None,
         subscribers: Sequence[Subscriber] = (),
+        provenance: Mapping[str, Any] | None = None,
     ) -> Take:
-        """Reset to `seed`, let the agent drive until it is finished or time is up, keep the take."""
+        """Reset to `seed`, let the agent drive until it is finished or time is up, keep the take.
+
+        `provenance` goes into its header: which policy drove, and how.
+        """
         self.twin.reset(seed, spread)
         header = header_of(self.twin, agent=agent_name, operator=operator, has_images=self._has_images())
+        header = dataclasses.replace(header, provenance=provenance or {})
         meter = ForceMeter()
         with self._recorder.start(header, realtime=False) as take:
             ending = Session(self.twin).run(

@@ -217,3 +217,30 @@ def test_a_take_that_stops_early_is_kept_and_told(
     with Studio(tmp_path) as data:
         (row,) = data.episodes()
         assert 0.0 < row.duration < 8.0
+
+
+def test_evaluate_ends_with_one_json_object(studio: Run, tmp_path: Path) -> None:
+    arguments = ("evaluate", "--task", "wiping", "--seeds", "1000:1002", "--data", tmp_path)
+    status, text, _ = studio(*arguments, "demonstrator", "--json", "--workers", 2)
+    told = last_json(text)
+    assert status == 0
+    assert told.keys() >= {"wilson_95", "force_mean_N", "force_max_N", "seconds_per_episode"}
+    assert (told["run"], told["task"], told["episodes"]) == ("demonstrator", "wiping", 2)
+    assert told["successes"] == 2
+    assert len(list(tmp_path.glob("episodes/wiping/*.mcap"))) == 2
+    status, text, _ = studio(*arguments, "nothing", "--compare", "demonstrator", "--json")
+    paired = last_json(text)["comparison"]
+    assert status == 0
+    assert (paired["pairs"], paired["difference"], paired["mcnemar_p"]) == (2, -1.0, 0.5)
+    assert "0 of 2 succeeded" in studio(*arguments, "nothing")[1]
+
+
+def test_evaluate_refuses_nonsense(studio: Run, tmp_path: Path) -> None:
+    for arguments, words in (
+        (("nobody", "--task", "wiping"), "No agent 'nobody'"),
+        (("nothing", "--task", "wiping", "--seeds", "a:b"), "1000:1020"),
+        (("nothing", "--task", "wiping", "--compare", "demonstrator"), "none yet"),
+    ):
+        status, _, complaint = studio("evaluate", *arguments, "--data", tmp_path)
+        assert status == 2
+        assert words in complaint

@@ -12,6 +12,11 @@ from studio.twin import Twin
 STREAM = 1  # of the seed: the demonstrator's choices are not those that drew the scene
 
 
+def demonstration(twin: Twin, seed: int) -> Iterator[Action]:
+    """The task's demonstration, action by action; each reads the world as the ones before have left it."""
+    return twin.task.demonstrate(twin.world, np.random.default_rng([STREAM, seed]))
+
+
 class ScriptedAgent:
     """Demonstrates the twin's task once; the seed decides style, timing and path."""
 
@@ -21,8 +26,7 @@ class ScriptedAgent:
         self._actions: Iterator[Action] = iter(())
 
     def reset(self, observation: Observation) -> None:
-        rng = np.random.default_rng([STREAM, self._seed])
-        self._actions = self._twin.task.demonstrate(self._twin.world, rng)
+        self._actions = demonstration(self._twin, self._seed)
 
     def act(self, observation: Observation) -> Action | None:
         return next(self._actions, None)

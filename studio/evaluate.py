@@ -1,0 +1,250 @@
+"""Rolling out one agent over many seeds: does it succeed, how hard does it press, how stiff is it?
+
+Time is the simulator's. A rollout ends when the agent is finished, when success has held for half a second,
+or when the task's time is up. One that raises is an error and counts neither as success nor as failure.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from controller.types import ARM_ROW, Action, Array, CartesianTarget, Observation, Step
+from studio import tasks
+from studio.evaluation import Curves, Evaluation, Rollout
+from studio.recorder import new_episode_id, versions
+from studio.references import REFERENCES
+from studio.session import CONTROL_PERIOD, Agent
+from studio.station import CONTACT, Station, Take
+from studio.twin import Twin
+
+HELD_SUCCESS = 0.5  # [s] for which success must hold to end a rollout
+CURVE_EVERY = 5  # ticks between two points of a curve: 20 Hz
+
+
+Hidden = Literal["images", "wrench"]
+Execution = Literal["replan", "ensemble"]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is evaluated. Two plans of the same task, seeds and spread meet the same scenes."""
+
+    agent: str  # one of `REFERENCES`
+    task: str
+    seeds: tuple[int, ...]
+    spread: float = 1.0
+    cameras: bool = False  # record images although the agent needs none
+
+    def __post_init__(self) -> None:
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
+            raise ValueError(f"An evaluation needs different seeds from 0 on, not {list(self.seeds)}.")
+        if self.agent not in REFERENCES:
+            raise KeyError(f"No agent {self.agent!r}; there are {sorted(REFERENCES)}.")
+        tasks.load(self.task)  # an unknown one is refused
+
+    @property
+    def run(self) -> str:
+        """The agent's name."""
+        return self.agent
+
+    def opened(self) -> Callable[[Twin], Agent]:
+        """What makes an agent for a twin that has just been reset. Once per process: a policy is loaded."""
+        return REFERENCES[self.agent]
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What a rollout's header tells of its agent."""
+        return {"run": self.run}
+
+
+@dataclass(slots=True)
+class Feel:
+    """Subscriber: what each arm feels and how stiff it is, tick by tick."""
+
+    force: list[Array] = field(default_factory=list)  # (arms,) [N] at the tick's beginning
+    stiffness: list[list[float]] = field(default_factory=list)  # (arms,) [N/m] mean; NaN under joint control
+    peak: float = 0.0  # [N] over all fast steps
+
+    def on_step(self, step: Step) -> None:
+        force = np.linalg.norm(step.applied.trace[:, :, ARM_ROW["wrench"]][..., :3], axis=-1)
+        self.force.append(force[:, 0])
+        self.peak = max(self.peak, float(force.max()))
+        self.stiffness.append(
+            [
+                float(arm.target.stiffness.translational.trace()) / 3
+                if isinstance(arm.target, CartesianTarget)
+                else math.nan
+                for arm in step.applied.action.arms
+            ]
+        )
+
+
+class UntilDone:
+    """Another agent, finished as soon as success has held."""
+
+    def __init__(self, agent: Agent, twin: Twin) -> None:
+        self._agent, self._twin = agent, twin
+        self._held = 0.0  # [s]
+
+    def reset(self, observation: Observation) -> None:
+        self._agent.reset(observation)
+
+    def act(self, observation: Observation) -> Action | None:
+        self._held = self._held + CONTROL_PERIOD if self._twin.progress().success else 0.0
+        return None if self._held > HELD_SUCCESS else self._agent.act(observation)
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    """What a worker sends back of one seed."""
+
+    rollout: Rollout
+    path: Path | None = None
+    feel: Feel = field(default_factory=Feel)
+    camera_error: str | None = None
+
+
+def evaluate(
+    plan: Plan,
+    data_dir: Path,
+    *,
+    workers: int = 1,
+    on_rollout: Callable[[Rollout, Path | None], None] = lambda rollout, path: None,
+) -> Evaluation:
+    """Roll out every seed and save what came of it; `on_rollout` hears of each with its episode."""
+    if workers < 1:
+        raise ValueError(f"Workers must be at least 1, not {workers}.")
+    started, evaluation_id = time.time(), new_episode_id(plan.task)
+    done = []
+    for one in _rollouts(plan, data_dir, evaluation_id, workers):
+        done.append(one)
+        on_rollout(one.rollout, one.path)
+    done.sort(key=lambda one: one.rollout.seed)
+    asked = "yes" if plan.cameras else "no"
+    evaluation = Evaluation(
+        evaluation_id=evaluation_id,
+        started=started,
+        run=plan.run,
+        task=plan.task,
+        spread=plan.spread,
+        provenance=plan.provenance,
+        versions=versions(),
+        rollouts=tuple(one.rollout for one in done),
+        curves=_curves(plan.task, [one.feel for one in done if one.rollout.error is None]),
+        images=next((one.camera_error for one in done if one.camera_error), asked),
+    )
+    evaluation.save(data_dir)
+    return evaluation
+
+
+def _rollouts(plan: Plan, data_dir: Path, evaluation_id: str, workers: int) -> Iterator[_Done]:
+    """In the order in which they end."""
+    if workers == 1:
+        with Station(plan.task, data_dir, cameras=plan.cameras) as station:
+            make_agent = plan.opened()
+            for seed in plan.seeds:
+                yield _roll_out(station, make_agent, plan, evaluation_id, seed)
+        return
+    with ProcessPoolExecutor(
+        min(workers, len(plan.seeds)), get_context("spawn"), _prepare, (plan, data_dir, evaluation_id)
+    ) as pool:
+        seeds: dict[Future[_Done], int] = {pool.submit(_roll_out_here, seed): seed for seed in plan.seeds}
+        for future in as_completed(seeds):
+            try:
+                yield future.result()
+            except BrokenProcessPool as error:
+                yield _Done(Rollout(seeds[future], False, error=f"A worker process died: {error}"))
+
+
+def _roll_out(
+    station: Station, make_agent: Callable[[Twin], Agent], plan: Plan, evaluation_id: str, seed: int
+) -> _Done:
+    feel, begun = Feel(), time.monotonic()
+    try:
+        take = station.record(
+            lambda twin: UntilDone(make_agent(twin), twin),
+            agent_name=plan.run,
+            operator="evaluation",
+            seed=seed,
+            spread=plan.spread,
+            subscribers=[feel],
+            provenance={"evaluation": evaluation_id, **plan.provenance},
+        )
+    except Exception as error:  # whatever stops one rollout must neither stop nor colour the others
+        return _Done(Rollout(seed, False, error=f"{type(error).__name__}: {error}"))
+    rollout = _rollout_of(take, feel, time.monotonic() - begun)
+    return _Done(rollout, take.path, feel, station.camera_error)
+
+
+def _rollout_of(take: Take, feel: Feel, wall_seconds: float) -> Rollout:
+    felt = np.max(feel.force, axis=1) if feel.force else np.zeros(0)
+    contact = felt[felt > CONTACT]
+    progress = take.ending.progress
+    return Rollout(
+        seed=take.seed,
+        success=progress.success,
+        error=take.error,
+        episode_id=take.episode_id,
+        progress=progress.value,
+        phase=progress.phase,
+        seconds=take.ending.seconds,
+        wall_seconds=wall_seconds,
+        contact_seconds=len(contact) * CONTROL_PERIOD,
+        force_mean_N=float(contact.mean()) if len(contact) else 0.0,
+        force_sd_N=float(contact.std()) if len(contact) else 0.0,
+        force_max_N=feel.peak,
+        impulse_Ns=float(contact.sum()) * CONTROL_PERIOD,
+        limits=take.limits,
+    )
+
+
+def _curves(task: str, feels: Sequence[Feel]) -> dict[str, Curves]:
+    """Of each arm, over all trials."""
+    return {
+        arm.name: _curve(
+            [np.array(feel.force)[:, n] for feel in feels if feel.force],
+            [np.array(feel.stiffness)[:, n] for feel in feels if feel.force],
+        )
+        for n, arm in enumerate(tasks.load(task).arms)
+    }
+
+
+def _curve(forces: Sequence[Array], stiffnesses: Sequence[Array]) -> Curves:
+    ticks = range(0, max(map(len, forces), default=0), CURVE_EVERY)
+    force = [np.array([trial[tick] for trial in forces if tick < len(trial)]) for tick in ticks]
+    stiffness = [np.array([t[tick] for t in stiffnesses if tick < len(t)]) for tick in ticks]
+    known = [row[np.isfinite(row)] for row in stiffness]
+    return Curves(
+        time_s=[round(tick * CONTROL_PERIOD, 3) for tick in ticks],
+        trials=[len(row) for row in force],
+        force_mean_N=[round(float(row.mean()), 4) for row in force],
+        force_sd_N=[round(float(row.std()), 4) for row in force],
+        stiffness_mean_N_m=[round(float(row.mean()), 2) if len(row) else None for row in known],
+        stiffness_sd_N_m=[round(float(row.std()), 2) if len(row) else None for row in known],
+    )
+
+
+# A worker process
+
+_worker: tuple[Station, Callable[[Twin], Agent], Plan, str]
+
+
+def _prepare(plan: Plan, data_dir: Path, evaluation_id: str) -> None:
+    global _worker
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers share the cores; read when torch is loaded
+    _worker = Station(plan.task, data_dir, cameras=plan.cameras), plan.opened(), plan, evaluation_id
+
+
+def _roll_out_here(seed: int) -> _Done:
+    return _roll_out(*_worker, seed)
