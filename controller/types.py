@@ -280,6 +280,15 @@ class Snapshot:
 
 
 @dataclass(frozen=True, slots=True)
+class InputTiming:
+    """How the hand that leads an arm reached us, when a control period began."""
+
+    age: float  # [s] since its newest pose was taken
+    latency: float  # [s] that this took from the device to us, estimated
+    jitter: float  # [s] by which the way differs from one pose to the next
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """One control period, told to the subscribers."""
 
@@ -290,6 +299,7 @@ class Step:
     task_state: Mapping[str, Array] | None  # board, object poses, at 20 Hz: the state at observation.time
     snapshot: Snapshot | None  # once a second: the state at observation.time
     late: float = 0.0  # [s] after its deadline that the period began; 0 where there is no clock
+    inputs: tuple[InputTiming | None, ...] = ()  # per arm that a tracked hand leads; () where none does
 
 
 def multiply_quaternions(a: Array, b: Array) -> Array:

@@ -9,6 +9,7 @@ time is the wall clock. Topics:
     /header                                       the header as JSON, first of all messages
     /{arm}/state                                  500 Hz, packed `ArmState`
     /{arm}/requested  /{arm}/applied  /tick       100 Hz
+    /{arm}/input                                  100 Hz while a tracked hand leads the arm
     /camera/{name}    /task_state                 20 Hz
     /snapshot                                     1 Hz
     /limits  /events  /outcome                    when there is something to tell
@@ -233,6 +234,10 @@ class EpisodeWriter:
             yield "/task_state", "studio.v1.Arrays", ns, schema.arrays_message(now, step.task_state)
         if step.snapshot is not None:
             yield "/snapshot", "studio.v1.Arrays", ns, schema.arrays_message(now, step.snapshot.arrays)
+        for arm, timing in zip(arms, step.inputs, strict=False):
+            if timing is not None:
+                row = np.array([[now, timing.age, timing.latency, timing.jitter]])
+                yield f"/{arm}/input", "studio.v1.Input", ns, schema.INPUT.encode(row)[0]
         if step.applied.limits:
             yield _limits_message(step.applied.limits, now, ns)
         if (n_view := math.floor(now / VIEW_PERIOD + 1e-6)) != self._n_view:
@@ -343,16 +348,20 @@ class Episode:
                           base_from_tcp (n, 7), wrench (n, 6), gripper (n,), as in `ArmState`
         {arm}/requested   100 Hz: time (m,), kind (m,) of "cartesian" "joint" "hold" "release",
         {arm}/applied     base_from_target (m, 7), stiffness (m, 12), q (m, 6), gripper (m,); NaN where absent
+        {arm}/input       100 Hz while a tracked hand led the arm: time (k,), and of its newest pose age (k,),
+                          latency (k,) from device to session and jitter (k,), all [s]
         tick              100 Hz: time (m,), wall (m,) unix time [s] when it was told, late (m,) [s]
         """
         layouts = {"tick": (schema.TICK, 0)}
         for arm in self.header.arms:
             layouts[f"{arm}/state"] = (schema.STATE, 0)
+            layouts[f"{arm}/input"] = (schema.INPUT, 0)
             layouts[f"{arm}/requested"] = layouts[f"{arm}/applied"] = (schema.ACTION, schema.ACTION_HEAD)
         for group in groups:
             if group not in layouts:
                 raise KeyError(f"No columns {group!r}; this episode has {sorted(layouts)}.")
-        chosen = {group: layouts[group] for group in groups or layouts}
+        recorded = [group for group in layouts if "/input" not in group or f"/{group}" in self._mcap.topics]
+        chosen = {group: layouts[group] for group in groups or recorded}
         wires = self._mcap.heads(
             {f"/{name}": start + packed.size for name, (packed, start) in chosen.items()}
         )

@@ -112,6 +112,8 @@ class LiveSession:
 
     def _look_around(self) -> None:
         """What happens by itself: countdowns, failing disks, the next scene to collect, being left alone."""
+        for text in self._hands.clutch_changes():
+            self._takes.add_event("clutch", text)
         self._takes.advance(self._robot.progress(), self._driver)
         if (seed := self._takes.due_seed()) is not None:
             driver = self._collector = self._driver if self._driver != "nobody" else self._collector
@@ -155,8 +157,18 @@ class LiveSession:
                 self._engage(command.arm, command.engaged)
             case m.SetMode():
                 self._hand(command.arm).mode = StiffnessMode(command.mode)
+            case m.SwitchMode():
+                self._hand(command.arm).switch_mode()
             case m.SetGripper():
                 self._hand(command.arm).gripper = command.opening
+            case m.Hands():
+                for sample in command.hands:
+                    if sample.arm < len(self._hands.hands):  # else it was meant for the scene before
+                        self._hand(sample.arm).track(sample, command)
+            case m.Clutch():
+                self._clutch(command)
+            case m.LoseHand():
+                self._hand(command.arm).lose(command.why)
             case m.Release():
                 self._release()
             case m.OperatorLeft():
@@ -198,6 +210,17 @@ class LiveSession:
             hand.engage(self._robot.arms[arm].servo.target)
         else:
             raise ValueError("Choose the operator as driver first.")
+
+    def _clutch(self, command: m.Clutch) -> None:
+        hand = self._hand(command.arm)
+        wanted = not hand.clutch.engaged if command.engaged is None else command.engaged
+        if not wanted:
+            hand.open_clutch()
+            return
+        hand.check_tracked()
+        if self._driver != "operator":
+            self._set_driver("operator", command.operator or self._operator)
+        hand.close_clutch(self._robot.arms[command.arm].servo.target)
 
     def _release(self) -> None:
         """Stop: every arm lets go of its press and waits to be engaged again."""
@@ -250,6 +273,7 @@ class LiveSession:
             self._cameras.clear()
         self._hands = OperatorAgent(self._robot.task.arms, self._config.stiffness_table)
         self._agent = self._hands
+        self._session.inputs = self._hands.timings
         self._resets += 1
         self._limits.clear()
         self._told_state.clear()
@@ -336,6 +360,8 @@ class LiveSession:
                     level=level,
                     why=why,
                     input_age=hand.input_age,
+                    opening=hand.gripper,
+                    hand=hand.status,
                 )
             )
         return m.Status(

@@ -26,6 +26,7 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Component = Annotated[float, Meta(ge=-1.01, le=1.01)]  # of a unit quaternion
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Countdown = Annotated[float, Meta(ge=0.0, le=600.0)]  # [s]
+Seconds = Annotated[float, Meta(ge=0.0, le=1e12)]
 Name = Annotated[str, Meta(max_length=200)]
 
 
@@ -88,6 +89,46 @@ class SetGripper(Message, frozen=True, kw_only=True):
     opening: Share  # 0 closed .. 1 open
 
 
+class SwitchMode(Message, frozen=True, kw_only=True):
+    """To the other of the arm's two stiffness modes."""
+
+    arm: ArmIndex
+
+
+class HandSample(msgspec.Struct, frozen=True, kw_only=True):
+    """One tracked hand, in base axes up to where the room's origin is."""
+
+    arm: ArmIndex  # that it leads while its clutch is engaged
+    position: tuple[Metres, Metres, Metres]  # [m]
+    wxyz: tuple[Component, Component, Component, Component]
+    opening: Share | None  # that its trigger asks of the gripper, 0 closed .. 1 open; None where it has none
+    scale: Annotated[float, Meta(ge=0.05, le=5.0)] = 1.0  # of the arm's way to the hand's
+
+
+class Hands(Message, frozen=True, kw_only=True):
+    """What a headset tracks. Newest wins; an arm whose hand is not heard of for a moment holds."""
+
+    hands: tuple[HandSample, ...]
+    sampled: Seconds  # [s] monotonic time of this machine at which the poses were taken, as far as is known
+    latency: Seconds = 0.0  # [s] of the way from the device, likewise
+    jitter: Seconds = 0.0  # [s] by which that way differs from sample to sample
+
+
+class Clutch(Message, frozen=True, kw_only=True):
+    """Connect an arm to its tracked hand, or hold it there; None does the other of the two."""
+
+    arm: ArmIndex
+    engaged: bool | None = None
+    operator: Name = ""  # the person's name
+
+
+class LoseHand(Message, frozen=True, kw_only=True):
+    """A hand is no more to be trusted: its arm stops pressing and waits for the clutch."""
+
+    arm: ArmIndex
+    why: Name  # a sentence for the operator
+
+
 class Release(Message, frozen=True, kw_only=True):
     """Let every arm's target run to where the arm is: stop pressing, now."""
 
@@ -147,7 +188,11 @@ Command = (
     | MoveTo
     | Nudge
     | SetMode
+    | SwitchMode
     | SetGripper
+    | Hands
+    | Clutch
+    | LoseHand
     | Release
     | OperatorLeft
     | StartTake
@@ -183,6 +228,16 @@ class Frame(Message, frozen=True, kw_only=True):
     arms: tuple[ArmFrame, ...]
 
 
+class HandStatus(msgspec.Struct, frozen=True):
+    """A tracked hand, as long as it is heard of."""
+
+    engaged: bool  # its clutch
+    why: str  # the clutch let go by itself; empty where it did not
+    age: float | None  # [s] since the newest pose was taken; None where none comes any more
+    latency: float  # [s] on its way here
+    jitter: float  # [s]
+
+
 class ArmStatus(msgspec.Struct, frozen=True):
     """One arm in the status."""
 
@@ -193,6 +248,8 @@ class ArmStatus(msgspec.Struct, frozen=True):
     level: Level
     why: str  # what is limited, for the operator; empty while all passes
     input_age: float | None  # [s] since the operator's last target; None before the first
+    opening: float = 0.0  # that is asked of the gripper, 0 closed .. 1 open
+    hand: HandStatus | None = None  # that may lead the arm
 
 
 class TakeStatus(msgspec.Struct, frozen=True):

@@ -52,6 +52,10 @@ _PROTO = {
             repeated double time = 1; repeated double wall = 2; repeated double late = 3;
             uint64 number = 4; bytes digest = 5;
         }
+        message Input {
+            repeated double time = 1; repeated double age = 2; repeated double latency = 3;
+            repeated double jitter = 4;
+        }
         message Limit { uint32 arm = 1; string kind = 2; string why = 3; bool refused = 4; }
         message Limits { repeated double time = 1; repeated Limit limits = 2; }
         message NamedArray {
@@ -255,6 +259,7 @@ class Packed:
 
 STATE = Packed({name: part.stop - part.start for name, part in ARM_ROW.items()})
 TICK = Packed({"time": 1, "wall": 1, "late": 1})  # followed by number and digest
+INPUT = Packed({"time": 1, "age": 1, "latency": 1, "jitter": 1})
 ACTION = Packed({"time": 1, "base_from_target": 7, "stiffness": 12, "q": 6, "gripper": 1}, first=2)
 ACTION_HEAD = 2  # [bytes] before the packed part: the field `kind`, whose values are the index + 1 in
 TARGET_KINDS = ("cartesian", "joint", "hold", "release")

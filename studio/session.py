@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from controller.types import Action, Applied, Array, Observation, Snapshot, Step
+from controller.types import Action, Applied, Array, InputTiming, Observation, Snapshot, Step
 
 if TYPE_CHECKING:
     from studio.tasks import Progress
@@ -84,6 +84,7 @@ class Session:
     def __init__(self, robot: Robot, *, realtime: bool = False) -> None:
         self.robot = robot
         self.clock = Clock(CONTROL_PERIOD) if realtime else None
+        self.inputs: Callable[[], tuple[InputTiming | None, ...]] = tuple  # of hands that drive, for takes
 
     def run(
         self,
@@ -132,7 +133,8 @@ class Session:
             snapshot = robot.save() if take_tick % SNAPSHOT_EVERY == 0 else None
             applied = robot.apply(requested)
             late = self.clock.delay if self.clock else 0.0
-            step = Step(observation, requested, applied, robot.digest(), task_state, snapshot, late)
+            digest, inputs = robot.digest(), self.inputs()
+            step = Step(observation, requested, applied, digest, task_state, snapshot, late, inputs)
         for subscriber in subscribers:
             subscriber.on_step(step)
         return step

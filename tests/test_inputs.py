@@ -8,6 +8,7 @@ from controller.types import ArmAction, CartesianTarget, Hold, Observation, Pose
 from studio import tasks
 from studio.inputs.operator import OperatorAgent, step_of
 from studio.inputs.stream import WATCHDOG, StreamAgent
+from studio.messages import Hands, HandSample
 
 NOTHING = Observation(0.0, (), {})
 POSE = Pose(np.array([0.4, 0.0, 0.2]), np.array([0.0, 1.0, 0.0, 0.0]))
@@ -104,3 +105,117 @@ def test_a_lost_hand_releases_its_arm_only() -> None:
     lost, other = stream.act(NOTHING).arms
     assert isinstance(lost.target, Release)
     assert other is wish
+
+
+# Tracked hands
+
+
+class Wand:
+    """A tracked hand and the agent that it leads, both arms of a two-armed task."""
+
+    def __init__(self) -> None:
+        self.now = Now()
+        self.agent = OperatorAgent(tasks.load("peg-cylinder").arms, now=self.now)
+
+    def show(self, *, x: float = 0.0, arm: int = 0, opening: float = 1.0, scale: float = 1.0) -> None:
+        sample = HandSample(
+            arm=arm, position=(x, 0.0, 1.2), wxyz=(1.0, 0.0, 0.0, 0.0), opening=opening, scale=scale
+        )
+        told = Hands(hands=(sample,), sampled=self.now.seconds, latency=0.004, jitter=0.001)
+        self.agent.hands[arm].track(sample, told)
+
+    def target(self, arm: int = 0) -> object:
+        return self.agent.act(NOTHING).arms[arm].target
+
+    def wait(self, seconds: float) -> None:
+        self.now.seconds += seconds
+
+
+@pytest.fixture
+def wand() -> Wand:
+    wand = Wand()
+    for arm in (0, 1):
+        wand.show(arm=arm)
+        wand.agent.hands[arm].close_clutch(POSE)
+    return wand
+
+
+def x_of(target: object) -> float:
+    assert isinstance(target, CartesianTarget)
+    return float(target.base_from_target.position[0])
+
+
+def test_a_clutched_hand_leads_from_where_the_target_was(wand: Wand) -> None:
+    assert x_of(wand.target()) == 0.4
+    wand.show(x=0.02)
+    assert x_of(wand.target()) == pytest.approx(0.42)
+    wand.agent.hands[0].move_to(Pose.identity())  # somebody drags the gizmo meanwhile
+    assert x_of(wand.target()) == pytest.approx(0.42)
+
+
+def test_an_open_clutch_holds_and_closing_it_elsewhere_goes_on_without_a_jump(wand: Wand) -> None:
+    hand = wand.agent.hands[0]
+    hand.open_clutch()
+    assert isinstance(wand.target(), Hold)
+    wand.show(x=0.5)
+    hand.close_clutch(POSE)
+    wand.show(x=0.51)
+    assert x_of(wand.target()) == pytest.approx(0.41)
+
+
+def test_a_silent_hand_holds_then_lets_go_and_the_other_arm_goes_on(wand: Wand) -> None:
+    for _ in range(11):  # 0.11 s
+        wand.wait(0.01)
+        wand.show(arm=1)
+    assert isinstance(wand.target(0), Hold)
+    assert isinstance(wand.target(1), CartesianTarget)
+    wand.show(x=0.01)
+    assert x_of(wand.target(0)) == pytest.approx(0.41)  # a gap in the network is no loss
+    for _ in range(51):
+        wand.wait(0.01)
+        wand.show(arm=1)
+    assert isinstance(wand.target(0), Release)
+    assert isinstance(wand.target(1), CartesianTarget)
+    wand.show()
+    assert isinstance(wand.target(0), Release)  # until the clutch is closed again
+    status = wand.agent.hands[0].status
+    assert status is not None
+    assert "Nothing was heard" in status.why
+
+
+def test_a_lost_or_jumping_hand_lets_go_and_says_why(wand: Wand) -> None:
+    wand.agent.hands[0].lose("The headset was taken off.")
+    wand.show(x=0.3, arm=1)
+    for arm, why in ((0, "taken off"), (1, "jumped by 30 cm")):
+        assert isinstance(wand.target(arm), Release)
+        status = wand.agent.hands[arm].status
+        assert status is not None
+        assert why in status.why
+    assert wand.agent.clutch_changes() == []  # neither was looked at while it led
+
+
+def test_a_clutch_takes_no_hand_that_is_not_tracked(wand: Wand) -> None:
+    wand.wait(1.0)
+    with pytest.raises(ValueError, match="not tracked"):
+        wand.agent.hands[0].close_clutch(POSE)
+
+
+def test_engaging_opens_no_gripper_and_the_trigger_takes_it_over(wand: Wand) -> None:
+    hand = wand.agent.hands[0]
+    start = hand.gripper
+    wand.show(opening=1.0 - start)
+    assert hand.gripper == start
+    wand.show(opening=start)
+    wand.show(opening=0.4)
+    assert hand.gripper == 0.4
+
+
+def test_the_way_of_a_hand_is_timed_while_it_leads(wand: Wand) -> None:
+    wand.wait(0.02)
+    first, second = wand.agent.timings()
+    assert first is not None
+    assert (first.age, first.latency, first.jitter) == pytest.approx((0.02, 0.004, 0.001))
+    assert second is not None
+    for hand in wand.agent.hands:
+        hand.open_clutch()
+    assert wand.agent.timings() == ()
