@@ -21,14 +21,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NewType
 
-from studio.messages import Command, MoveTo, Notice, Nudge, OperatorLeft
+from studio.messages import Command, Hands, LoseHand, MoveTo, Notice, Nudge, OperatorLeft
 
 PersonId = NewType("PersonId", str)
 
 GRACE = 0.5  # [s] without a connection after which the holder has left
 PATIENCE = 10.0  # [s] without a command after which who was asked has let go
 LONGEST_NAME = 60  # characters
-STREAMED = (MoveTo, Nudge)  # they go on with what somebody began
+STREAMED = (MoveTo, Nudge, Hands, LoseHand)  # they go on with what somebody began
 
 Timer = Callable[[float, Callable[[], None]], object]
 

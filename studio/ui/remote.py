@@ -10,7 +10,7 @@ from typing import Literal
 
 from studio.channels import Latest, Mailbox
 from studio.link import Link, connect
-from studio.messages import CameraImage, Command, Frame, MoveTo, Notice, Report, Status, TaskState
+from studio.messages import CameraImage, Command, Frame, Hands, MoveTo, Notice, Report, Status, TaskState
 
 SILENCE = 1.5  # [s] without a frame after which the session counts as stuck; it sends 33 a second
 
@@ -26,6 +26,7 @@ class Remote:
         self.task_state: Latest[TaskState] = Latest()
         self.images: dict[str, CameraImage] = {}  # newest of each camera
         self.notices: Mailbox[Notice] = Mailbox()
+        self.newest_notice: Latest[Notice] = Latest()
         self._link: Link | None = None
         self._heard = 0.0  # [s] monotonic time of the newest report
         self._waiting: deque[Command] = deque()
@@ -71,12 +72,10 @@ class Remote:
         self._framed.clear()
 
     def post(self, command: Command) -> None:
-        """Send soon, in order. A target that still waits is replaced by the next one for its arm."""
+        """Send soon, in order. A target or hands that still wait are replaced by the next of their kind."""
         with self._changed:
-            if isinstance(command, MoveTo) and self._waiting:
-                last = self._waiting[-1]
-                if isinstance(last, MoveTo) and last.arm == command.arm:
-                    self._waiting.pop()
+            if self._waiting and _replaces(command, self._waiting[-1]):
+                self._waiting.pop()
             self._waiting.append(command)
             self._changed.notify()
 
@@ -102,7 +101,14 @@ class Remote:
             case TaskState():
                 self.task_state.set(_merged(self.task_state.get()[0], report))
             case Notice():
+                self.newest_notice.set(report)
                 self.notices.post(report)
+
+
+def _replaces(command: Command, before: Command) -> bool:
+    if isinstance(command, MoveTo):
+        return isinstance(before, MoveTo) and before.arm == command.arm
+    return isinstance(command, Hands) and isinstance(before, Hands)
 
 
 def _merged(known: TaskState | None, told: TaskState) -> TaskState:
