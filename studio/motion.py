@@ -65,6 +65,14 @@ class Motion:
             distance = float(np.linalg.norm(point - self.pose.position))
             yield from self.move(Pose(point, self.pose.wxyz), distance / speed, linear=True)
 
+    def grip(self, opening: float, seconds: float) -> Iterator[ArmAction]:
+        """Open (1) or close (0) the hand evenly: both fingers meet what lies between them softly."""
+        start = self.gripper
+        n = max(1, round(seconds / self._speed / CONTROL_PERIOD))
+        for share in np.arange(1, n + 1) / n:
+            self.gripper = float(start + share * (opening - start))
+            yield self.action()
+
     def wait(self, seconds: float) -> Iterator[ArmAction]:
         for _ in range(max(1, round(seconds / self._speed / CONTROL_PERIOD))):
             yield self.action()

@@ -19,12 +19,13 @@ from controller.types import (
     quaternion_from_rotation_vector,
 )
 from studio.api import Studio
+from studio.eraser import HALF
 from studio.inputs.scripted import ScriptedAgent
 from studio.motion import Motion
 from studio.replay import ReplayAgent
 from studio.session import Ending, Session
 from studio.station import ForceMeter
-from studio.tasks.wiping import BOARD_CENTER, ERASER_HALF, MARK_LENGTH, MARK_OFFSET
+from studio.tasks.wiping import BOARD_CENTER, MARK_LENGTH, MARK_OFFSET
 from studio.twin import Twin
 
 SEEDS = range(200, 220)
@@ -81,7 +82,7 @@ def test_one_pass_over_the_mark_succeeds(twin: Twin) -> None:
 
 
 def test_a_blind_sweep_through_the_middle_passes_at_most_6_of_20(twin: Twin) -> None:
-    reach = MARK_OFFSET + MARK_LENGTH[1] / 2 + ERASER_HALF[0]
+    reach = MARK_OFFSET + MARK_LENGTH[1] / 2 + HALF[0]
     wiped = 0
     for seed in SEEDS:
         twin.reset(seed)

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from controller.types import Action, ArmAction, Array, Pose, StiffnessMode
+from studio.eraser import FLANGE_FROM_FELT, add_eraser, held
 from studio.motion import Motion
-from studio.tasks import ArmSetup, CameraView, Grasp, Progress, World
-from studio.tasks.wiping import ERASER_CENTER, ERASER_MASS, FLANGE_FROM_TCP, add_eraser
+from studio.tasks import ArmSetup, CameraView, Progress, World
 
 APART = 0.9  # [m] between the bases, along y
 GAP = 0.04  # [m] between the felts at the start
@@ -24,11 +24,11 @@ def _setup(name: str, side: float) -> ArmSetup:
     return ArmSetup(
         name=name,
         base_position=np.array([0.0, -side * APART / 2, 0.0]),
-        flange_from_tcp=FLANGE_FROM_TCP,
+        flange_from_tcp=FLANGE_FROM_FELT,
         world_from_home=Pose.of(tool, np.array([0.5, -side * GAP / 2, 0.3])),
         modes=(StiffnessMode.HIGH, StiffnessMode.LOW),
         workspace=(np.array([0.2, -0.4, 0.1]), np.array([0.8, 0.4, 0.6])),
-        grasp=Grasp(f"{name}_eraser", FLANGE_FROM_TCP, ERASER_MASS, ERASER_CENTER),
+        grasp=held(f"{name}_eraser"),
     )
 
 

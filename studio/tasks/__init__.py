@@ -96,6 +96,21 @@ class World:
         view = self.data.site(f"{arm}_tcp")
         return Pose.of(view.xmat.reshape(3, 3), view.xpos)
 
+    def place(self, body: str, pose: Pose) -> None:
+        """Put a free body at rest at world_from_body."""
+        joint = self.data.joint(body)
+        joint.qpos[:] = pose.vector
+        joint.qvel[:] = 0.0
+
+    def geoms_of(self, body: str) -> Array:
+        """(ngeom,) bool"""
+        return np.asarray(self.model.geom_bodyid == self.model.body(body).id)
+
+    def touches(self, some: Array, others: Array) -> bool:
+        """Whether any of `some` geoms touches any of `others`, each (ngeom,) bool."""
+        first, second = self.data.contact.geom.T
+        return bool(((some[first] & others[second]) | (some[second] & others[first])).any())
+
     def normal_force(self, geom: int, other: int) -> float:
         """Summed normal force [N] between two geoms, by id."""
         pairs = self.data.contact.geom

@@ -14,38 +14,24 @@ import mujoco
 import numpy as np
 
 from controller.types import Action, Array, Pose, StiffnessMode
+from studio import eraser
 from studio.board import Board
 from studio.motion import Motion
 from studio.session import CONTROL_PERIOD
-from studio.tasks import ArmSetup, CameraView, Grasp, Progress, World
+from studio.tasks import ArmSetup, CameraView, Progress, World
 
 BOARD_CENTER = np.array([0.50, 0.0, 0.02])  # [m] top face, in the world
-
-ERASER_HALF = np.array([0.015, 0.017])  # [m] half sides of the felt along tool x and y: 3 cm by 3.4 cm
-FELT_THICKNESS = 0.008  # [m]
-BLOCK_HEIGHT = 0.045  # [m]
-ERASER_MASS = 0.08  # [kg]
-ERASER_CENTER = np.array([0.0, 0.0, -0.0265])  # [m] of mass, from the felt's centre
-# Soft felt that stays quiet under FDCC and takes the edge off an impact.
-FELT_SOLREF = (0.008, 1.0)
-FELT_SOLIMP = (0.5, 0.95, 0.0015, 0.5, 2.0)
-FELT_FRICTION = (0.2, 0.005, 0.0001)  # more than 0.2 makes the servoed arm hop
 
 MARK_OFFSET = 0.05  # [m] the mark's centre lies within this of the board's centre, in x and in y
 MARK_LENGTH = (0.04, 0.065)  # [m] along y
 MARK_WAVE = (0.008, 0.011)  # [m] amplitude across the line
+MARK_TURNS = (0.7, 1.2)  # periods of the wave
 MARK_RADIUS = 0.004  # [m] of the pen: the mark is at most 2 (11 + 4) mm = 3 cm across
 START_JITTER = 0.015  # [m] on each axis of the start pose
 
 WIPED_ENOUGH = 0.9  # share of the mark's cells
 LIFTED = 0.3  # [s] without contact that ends the go
 GO_STARTS = 0.02  # share wiped from which touching counts as the go
-
-LOW_LAG = 0.36  # [s] by which the tool trails its target at low stiffness (`studio bench --only contact`)
-
-# The tool points down: tool z = -z, tool x (where the fingers close) = -y, tool y = -x of the world.
-DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-FLANGE_FROM_TCP = Pose(np.array([0.0, 0.0, 0.2]), np.array([1.0, 0.0, 0.0, 0.0]))  # the felt's centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,41 +58,33 @@ class Task:
         ArmSetup(
             name="right",
             base_position=np.zeros(3),
-            flange_from_tcp=FLANGE_FROM_TCP,
-            world_from_home=Pose.of(DOWN, np.array([0.36, 0.0, 0.20])),
+            flange_from_tcp=eraser.FLANGE_FROM_FELT,
+            world_from_home=Pose.of(eraser.DOWN, np.array([0.36, 0.0, 0.20])),
             modes=(StiffnessMode.MEDIUM, StiffnessMode.LOW),
             workspace=(np.array([0.25, -0.25, -0.03]), np.array([0.70, 0.25, 0.45])),
-            grasp=Grasp("eraser", FLANGE_FROM_TCP, ERASER_MASS, ERASER_CENTER),
+            grasp=eraser.held(),
         ),
     )
     cameras = (
         CameraView("front", np.array([0.92, 0.0, 0.62]), np.array([0.48, 0.0, 0.03]), fovy=34.0),
-        CameraView(
-            "right_wrist",
-            np.array([0.0, -0.11, 0.02]),
-            np.array([0.0, -0.035, 0.2]),
-            fovy=75.0,
-            arm="right",
-            up=np.array([0.0, -1.0, 0.0]),
-        ),
+        eraser.wrist_camera("right"),
     )
 
     def __init__(self) -> None:
         self.board = Board()
+        self._eraser = eraser.Eraser(self.board, BOARD_CENTER)
         self._mark = np.zeros((2, 2))  # (n, 2) [m] polyline in board axes
         self._cells = 0  # inked cells at the start
         self._go = 0  # 0 before, 1 during, 2 after the one go
         self._wiped = 0.0  # share wiped in the go
         self._airborne = 0.0  # [s] since the last contact
-        self._felt = np.full(3, np.nan)  # (3,) [m] the felt's centre a period ago, in the world
 
     def build(self, spec: mujoco.MjSpec) -> None:
         Board.build(spec, BOARD_CENTER)
-        add_eraser(spec, "eraser")
+        eraser.add_eraser(spec)
 
     def bind(self, world: World) -> None:
-        self._felt_geom = world.model.geom("eraser_felt").id
-        self._board_geom = world.model.geom("board").id
+        self._eraser.bind(world)
 
     def start_poses(self, rng: np.random.Generator, spread: float) -> tuple[Pose, ...]:
         jitter = rng.uniform(-START_JITTER, START_JITTER, 3) * spread
@@ -115,25 +93,15 @@ class Task:
 
     def initialize(self, world: World, rng: np.random.Generator, spread: float) -> None:
         center = rng.uniform(-MARK_OFFSET, MARK_OFFSET, 2) * spread
-        length = rng.uniform(*MARK_LENGTH)
-        wave = rng.uniform(*MARK_WAVE)
-        phase, turns = rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.2)
-        along = np.linspace(-0.5, 0.5, 40)
-        across = wave * np.sin(phase + 2 * np.pi * turns * along)
-        across -= (across.min() + across.max()) / 2
-        self._mark = center + np.stack((across, length * along), axis=1)
+        self._mark = eraser.wavy_line(rng, center, MARK_LENGTH, MARK_WAVE, MARK_TURNS)
         self.board.clear()
         self.board.draw(self._mark, MARK_RADIUS)
         self._cells = self.board.inked()
         self._go, self._wiped, self._airborne = 0, 0.0, 0.0
-        self._felt = world.pose("eraser").position
+        self._eraser.reset(world)
 
     def update(self, world: World) -> None:
-        pose = world.pose("eraser")
-        force = world.normal_force(self._felt_geom, self._board_geom)
-        rub = float(np.linalg.norm((pose.position - self._felt)[:2]))
-        self.board.wipe(pose.position - BOARD_CENTER, pose.rotation, ERASER_HALF, 0.0, rub, force)
-        self._felt = pose.position
+        force = self._eraser.wipe(world)
         self._airborne = 0.0 if force > 0 else self._airborne + CONTROL_PERIOD
         wiped = 1.0 - self.board.inked() / max(self._cells, 1)
         if self._go == 0 and wiped >= GO_STARTS:
@@ -158,7 +126,7 @@ class Task:
             **self.board.state(),
             "mark": self._mark.copy(),
             "wiping": np.array([self._cells, self._go, self._wiped, self._airborne]),
-            "felt": self._felt.copy(),
+            "felt": self._eraser.state(),
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
@@ -166,7 +134,7 @@ class Task:
         self._mark = np.array(state["mark"])
         cells, go, wiped, airborne = state["wiping"].tolist()
         self._cells, self._go, self._wiped, self._airborne = int(cells), int(go), wiped, airborne
-        self._felt = np.array(state["felt"])
+        self._eraser.restore(state["felt"])
 
     def texture(self) -> tuple[str, Array]:
         return Board.TEXTURE, self.board.picture()
@@ -183,14 +151,14 @@ class Task:
         mark = BOARD_CENTER[:2] + self._mark
         x = (mark[:, 0].min() + mark[:, 0].max()) / 2
         # The sweep runs from +y to -y and begins with the felt clear of the mark.
-        clear = ERASER_HALF[0] + MARK_RADIUS
+        clear = eraser.HALF[0] + MARK_RADIUS
         begin = np.array([x, mark[:, 1].max() + clear + 0.008, BOARD_CENTER[2]])
         end = np.array([x, mark[:, 1].min() - clear, BOARD_CENTER[2]])
         up = np.array([0.0, 0.0, 1.0])
         tilt = home.wxyz
         hover = begin + style.hover * up + (np.array([-0.03, 0.02, 0.0]) if style.slanted else 0.0)
         deep = style.depth * rng.uniform(0.85, 1.15) * up
-        lag = LOW_LAG * style.speed  # [m]
+        lag = eraser.LOW_LAG * style.speed  # [m]
 
         for part in (
             hand.move(Pose(hover + jitter(0.003), tilt), rng.uniform(1.3, 1.7)),
@@ -221,30 +189,3 @@ class Task:
         ):
             for action in part:
                 yield Action((action,))
-
-
-def add_eraser(spec: mujoco.MjSpec, name: str) -> None:
-    """A free body, its origin in the middle of the felt's face; geoms `{name}_felt` and `{name}_block`."""
-    eraser = spec.worldbody.add_body(name=name, mass=ERASER_MASS, ipos=ERASER_CENTER)
-    eraser.inertia = (4e-5, 3e-5, 2.5e-5)
-    eraser.explicitinertial = True
-    eraser.add_freejoint(name=name)
-    eraser.add_geom(
-        name=f"{name}_felt",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(*ERASER_HALF, FELT_THICKNESS / 2),
-        pos=(0, 0, -FELT_THICKNESS / 2),
-        rgba=(0.25, 0.27, 0.30, 1),
-        friction=FELT_FRICTION,
-        solref=FELT_SOLREF,
-        solimp=FELT_SOLIMP,
-        priority=2,
-    )
-    eraser.add_geom(
-        name=f"{name}_block",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(*ERASER_HALF, BLOCK_HEIGHT / 2),
-        pos=(0, 0, -FELT_THICKNESS - BLOCK_HEIGHT / 2),
-        rgba=(0.85, 0.55, 0.20, 1),
-        condim=6,
-    )
