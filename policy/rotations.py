@@ -37,10 +37,15 @@ def six_numbers(matrix: Array) -> Array:
 
 
 def from_six_numbers(numbers: Array) -> Array:
-    """The rotation (..., 3, 3) nearest in Gram and Schmidt's sense to any (..., 6) but degenerate ones."""
-    first = _normalised(numbers[..., :3])
+    """The rotations (..., 3, 3) of any (..., 6), by Gram and Schmidt where that can be done."""
+    first = _unit(numbers[..., :3], np.array([1.0, 0.0, 0.0]))
     second = numbers[..., 3:] - (first * numbers[..., 3:]).sum(-1, keepdims=True) * first
-    second = _normalised(second)
+    across = np.cross(
+        first, np.eye(3)[np.abs(first).argmin(-1)]
+    )  # along the axis that first is furthest from
+    second = _unit(second, across / np.linalg.norm(across, axis=-1, keepdims=True))
+    second = second - (first * second).sum(-1, keepdims=True) * first  # once more, against rounding
+    second = second / np.linalg.norm(second, axis=-1, keepdims=True)
     return np.stack((first, second, np.cross(first, second)), axis=-1)
 
 
@@ -70,5 +75,7 @@ def _rotation(wxyz: Array) -> Rotation:
     return Rotation.from_quat(np.roll(wxyz.reshape(-1, 4), -1, axis=-1))
 
 
-def _normalised(vector: Array) -> Array:
-    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12))
+def _unit(vector: Array, otherwise: Array) -> Array:
+    """Vectors (..., 3) at length one; `otherwise` where they have none."""
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.where(length > 1e-6, vector / np.maximum(length, 1e-6), otherwise)
