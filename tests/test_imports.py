@@ -24,7 +24,7 @@ ONLY_IN = {
     "mcap": ("studio/episode.py", "studio/mcap_file.py"),
     "viser": ("studio/ui/", "studio/server.py"),
     "rerun": ("studio/export/rrd.py",),
-    "openvr": ("studio/inputs/xr.py",),
+    "openvr": ("studio/inputs/steamvr.py",),
     "ray": ("studio/jobs.py",),
     "h5py": ("studio/export/act_hdf5.py",),
     "av": ("studio/export/lerobot.py",),
