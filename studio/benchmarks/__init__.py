@@ -11,7 +11,19 @@ from typing import Any, Literal
 from studio.recorder import versions
 
 # Modules with a `measure()`.
-PARTS = ("fdcc", "contact", "loop", "cameras", "episodes", "live", "gizmo", "scene", "proxy", "review")
+PARTS = (
+    "fdcc",
+    "contact",
+    "loop",
+    "cameras",
+    "episodes",
+    "live",
+    "gizmo",
+    "scene",
+    "proxy",
+    "review",
+    "page",
+)
 
 Results = dict[str, Any]  # what a part measured
 
@@ -93,6 +105,7 @@ GOALS = (
     Goal(
         "scene", "poses of two arms, to a viewer [kB/s]", lambda r: r["two_arms_stream_kB_per_s"], "<=", 60.0
     ),
+    Goal("page", "first full render in Chromium [s]", lambda r: r["first_render_s"], "<=", 6.0),
     Goal(
         "gizmo",
         "isolated move of the gizmo to the servo, p95 [ms]",

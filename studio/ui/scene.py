@@ -33,6 +33,9 @@ PAPER_SHADE = 0.9  # the picture is not lit; as bright as it comes it would glar
 ONE_ARM_VIEW = np.array([0.45, -0.85, 0.42])
 TWO_ARM_VIEW = np.array([-0.75, -0.18, 0.62])
 
+FIELD_OF_VIEW = float(np.radians(40.0))
+ARM_WIDTH = 0.12  # [m] about, from a base's middle to the edge of the picture
+
 LIVE = "/live"  # root of the view that everybody shares
 REVIEW = "/review"  # root of a client's own view
 
@@ -79,6 +82,7 @@ class SceneModel:
         self.nodes = self._nodes()
         self.ghosts = tuple(self._ghost(arm) for arm in self.task.arms)
         self.picture = self._picture()
+        self.bases = [self._at_rest.body(f"{arm.name}_base").xpos.copy() for arm in self.task.arms]  # [m]
         self.first_view = ONE_ARM_VIEW if len(self.task.arms) == 1 else TWO_ARM_VIEW
 
     def ink(self, state: Mapping[str, Array]) -> Array | None:
@@ -328,6 +332,10 @@ def set_stage(server: viser.ViserServer, model: SceneModel) -> None:
     center = (low + high) / 2
     scene.set_up_direction("+z")
     scene.configure_default_lights(cast_shadow=False)
+    # An environment map must be filtered before anything is drawn: ten seconds where the browser draws in
+    # software. Light from all sides comes from the sky instead.
+    scene.configure_environment_map(None)
+    scene.add_light_hemisphere("/sky", ground_color=(110, 114, 122), intensity=3.6, position=(0.0, 0.0, 1.0))
     scene.add_grid(
         "/table",
         width=2.4,
@@ -345,10 +353,13 @@ def set_stage(server: viser.ViserServer, model: SceneModel) -> None:
     )
     look_at = center - [0.12, 0.0, 0.0]
     look_at[2] = 0.22
-    distance = 0.8 + float(np.linalg.norm(high[:2] - low[:2]))
+    # All of the robot: between the panels the view is about as high as wide.
+    reach = max(float(np.linalg.norm(base - look_at)) for base in model.bases)
+    direction = model.first_view / np.linalg.norm(model.first_view)
+    distance = (reach + ARM_WIDTH) / np.tan(FIELD_OF_VIEW / 2)
     server.initial_camera.look_at = tuple(look_at)
-    server.initial_camera.position = tuple(look_at + distance * model.first_view)
-    server.initial_camera.fov = float(np.radians(40.0))
+    server.initial_camera.position = tuple(look_at + distance * direction)
+    server.initial_camera.fov = FIELD_OF_VIEW
 
 
 def hide(client: viser.ClientHandle, root: str = LIVE) -> viser.FrameHandle:
