@@ -9,8 +9,8 @@
 
 A person is whoever holds one cookie (`studio.door.person_of`): all pages of a browser are one person, a
 headset is another. A free lease is taken by the first command that means to act; a stream of targets never
-takes it. It passes when its holder hands it over, or does nothing for `PATIENCE` after being asked; it is lost
-when the holder's last connection has been gone for `GRACE`. Whenever it changes hands the arms hold.
+takes it. It passes when its holder hands it over, or does nothing for `PATIENCE` after being asked; it is
+lost when the holder's last connection has been gone for `GRACE`. Whenever it changes hands the arms hold.
 """
 
 from __future__ import annotations

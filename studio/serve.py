@@ -29,7 +29,8 @@ from studio import tasks
 from studio.api import Studio
 from studio.link import socket_path
 from studio.messages import Shutdown
-from studio.server import LOOPBACK, PORT, FrontServer, make_app, start_viser
+from studio.proxy import LOOPBACK
+from studio.server import PORT, FrontServer, make_app, start_viser
 from studio.ui.app import Page
 from studio.ui.remote import Remote
 

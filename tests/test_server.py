@@ -202,15 +202,22 @@ def test_viser_is_not_asked_what_it_does_not_know(page: Page, caplog: pytest.Log
 
 
 def test_messages_pass_byte_for_byte_both_ways() -> None:
-    messages = ["", b"", "grüß\N{ROBOT FACE}", os.urandom(70_000), os.urandom(20_000_000)]
+    messages = ["", b"", "grüß\N{ROBOT FACE}", os.urandom(70_000), os.urandom(1_000_000)]
+    big = os.urandom(20_000_000)
+
+    def echo_and_more(connection: ServerConnection) -> None:
+        connection.send(big)
+        echo(connection)
+
     with (
-        websocket_upstream(echo) as port,
+        websocket_upstream(echo_and_more) as port,
         front_of(port) as front,
         open_socket(front, max_size=None, subprotocols=["first", "second"]) as browser,
     ):
         assert browser.subprotocol == "second"  # the one that the server behind chose
         assert browser.response is not None
         assert "Sec-WebSocket-Extensions" not in browser.response.headers  # offered, and declined
+        assert browser.recv(timeout=10) == big
         for message in messages:
             browser.send(message)
             assert browser.recv(timeout=10) == message
@@ -407,9 +414,9 @@ def test_a_name_that_was_made_to_mean_loopback_is_refused(alone: FrontServer, ho
 
 
 def test_other_addresses_may_have_other_names() -> None:
-    with FrontServer(make_app(NOBODY), host="0.0.0.0", port=0) as front:
-        answer = httpx.get(f"{front.url}/api/v1/health", headers={"Host": "studio.lan"})
-        assert answer.status_code == 200
+    with FrontServer(make_app(NOBODY), host="0.0.0.0", port=0, token="t") as front:
+        headers = {"Host": "studio.lan", "Authorization": "Bearer t"}
+        assert httpx.get(f"{front.url}/api/v1/health", headers=headers).status_code == 200
 
 
 def test_no_other_page_may_frame_ours(alone: FrontServer) -> None:
@@ -429,6 +436,23 @@ CAMERA = {
     "image_height": 9,
     "image_width": 9,
 }
+
+
+def test_a_message_of_ten_megabytes_ends_the_connection_and_goes_no_further() -> None:
+    heard: list[object] = []
+
+    def hear(connection: ServerConnection) -> None:
+        try:
+            heard.append(connection.recv())
+        except ConnectionClosed:
+            heard.append(connection.close_code)
+
+    with websocket_upstream(hear) as port, front_of(port) as front, open_socket(front) as browser:
+        with suppress(ConnectionClosed):
+            browser.send(bytes(10_000_000))
+        wait_for(lambda: heard == [1009])
+        browser.recv_events_thread.join(10)
+        assert not browser.recv_events_thread.is_alive()
 
 
 def press(button: viser.GuiButtonHandle) -> bytes:
