@@ -78,6 +78,7 @@ def demo(
     workers: int = 1,
     cameras: bool = True,
     spread: float = 1.0,
+    stiffness_table: Literal["tuned", "literal"] = "tuned",
     json: Json = False,
 ) -> int:
     """Record scripted demonstrations, headless.
@@ -88,6 +89,7 @@ def demo(
         workers: Processes that record side by side.
         cameras: Record images, too.
         spread: Above 1 widens the task's randomisation.
+        stiffness_table: What low, medium and high mean: our values, or the paper's numbers on all diagonals.
     """
     from studio.api import Studio
 
@@ -99,6 +101,7 @@ def demo(
             cameras=cameras,
             workers=workers,
             spread=spread,
+            stiffness_table=stiffness_table,
             on_take=lambda take: advance(),
         )
     if json:
@@ -121,6 +124,11 @@ def evaluate(
     episodes: int = 20,
     seed: int = 1000,
     seeds: str | None = None,
+    hide: tuple[Literal["images", "objects", "wrench"], ...] = (),
+    execution: Literal["replan", "ensemble"] = "replan",
+    replan_every: int | None = None,
+    latency: float = 0.02,
+    device: str = "cpu",
     compare: str | None = None,
     data: Data = DATA,
     workers: int = 1,
@@ -131,11 +139,18 @@ def evaluate(
     """Roll out an agent over many seeds; every rollout is an episode.
 
     Args:
-        agent: demonstrator, nothing, average, replay, all-low, all-high, off-compliant or off-joint.
-        task: What it does.
+        agent: A run, the folder of a run or checkpoint, ws://HOST:PORT of a policy server, or a reference:
+            demonstrator, nothing, average, replay, all-low, all-high, off-compliant, off-joint.
+        task: What it does; a policy knows its own.
         episodes: How many; their seeds are seed, seed + 1, …
         seed: Of the first episode.
         seeds: Instead of these two, e.g. 1000:1020 (the last excluded) or 3,5,8.
+        hide: From a policy: its images or wrenches (their training mean instead), or in the images the marks
+            and objects that no hand holds at the start.
+        execution: Play each chunk until the next, or the average of all.
+        replan_every: Steps of a chunk between two questions; 10, or 1 for ensemble.
+        latency: Seconds between question and answer, in simulated time.
+        device: Of the policy: cpu or cuda.
         compare: An evaluation, or an agent whose newest one is meant, on the same scenes.
         workers: Processes that roll out side by side.
         cameras: Record images although the agent needs none.
@@ -145,7 +160,19 @@ def evaluate(
     from studio.evaluate import Plan
     from studio.evaluation import compare as compared
 
-    plan = Plan(agent, task or "", _seeds(seeds, seed, episodes), spread=spread, cameras=cameras)
+    plan = Plan.of(
+        agent,
+        task,
+        _seeds(seeds, seed, episodes),
+        data,
+        hide=hide,
+        execution=execution,
+        replan_every=replan_every,
+        latency=latency,
+        device=device,
+        spread=spread,
+        cameras=cameras,
+    )
     with Studio(data) as studio:
         other = studio.evaluation(compare, plan.task) if compare else None
         with _progress(f"{plan.run} on {plan.task}", len(plan.seeds), quiet=json) as advance:
@@ -162,6 +189,36 @@ def evaluate(
         if comparison:
             console.print(str(comparison))
     return int(any(rollout.error is not None for rollout in found.rollouts))
+
+
+def policy_server(
+    agent: Positional[Annotated[str, arg(metavar="RUN")]],
+    host: str = "127.0.0.1",
+    port: int = 0,
+    hide: tuple[Literal["images", "wrench"], ...] = (),
+    device: str = "cpu",
+    once: bool = False,
+    data: Data = DATA,
+) -> int:
+    """Let other processes ask a policy, until Ctrl-C.
+
+    They need the token: what $STUDIO_POLICY_TOKEN holds, or the one that is told.
+
+    Args:
+        agent: A run, or the folder of a run or checkpoint.
+        host: Where to listen; only this machine by default.
+        port: 0 takes a free one.
+        hide: Replace images or wrenches by their training mean.
+        device: cpu or cuda.
+        once: End when the first client has left.
+    """
+    from studio import policy_link
+    from studio.evaluate import folder_of
+
+    policy_link.serve_policy(
+        folder_of(agent, data), host, port, hide=hide, device=device, once=once, tell=_say
+    )
+    return 0
 
 
 def _seeds(text: str | None, first: int, count: int) -> tuple[int, ...]:
@@ -355,6 +412,7 @@ def serve(
     port: int = 8080,
     task: str = "wiping",
     cameras: bool = True,
+    stiffness_table: Literal["tuned", "literal"] = "tuned",
     open: bool = False,
 ) -> int:
     """Serve the page: drive, record and review in the browser, until Ctrl-C.
@@ -364,11 +422,21 @@ def serve(
         port: 0 takes a free one.
         task: What is on the stage first.
         cameras: Render images.
+        stiffness_table: What low, medium and high mean: our values, or the paper's numbers on all diagonals.
         open: Open the page in this machine's browser.
     """
     from studio import serve as server
 
-    server.serve(data, host, port, task, cameras=cameras, open_page=open, tell=_say)
+    server.serve(
+        data,
+        host,
+        port,
+        task,
+        cameras=cameras,
+        stiffness_table=stiffness_table,
+        open_page=open,
+        tell=_say,
+    )
     return 0
 
 
@@ -400,6 +468,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "doctor": doctor,
     "demo": demo,
     "evaluate": evaluate,
+    "policy-server": policy_server,
     "episodes": episodes,
     "show": show,
     "annotate": annotate,

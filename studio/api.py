@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Unpack
 
+from controller.servo import ServoConfig
+from controller.stiffness import StiffnessTable
 from studio import replay as replays
 from studio import tasks
 from studio.catalog import Catalog, Refreshed
@@ -71,10 +73,12 @@ class Studio:
         cameras: bool = True,
         workers: int = 1,
         spread: float = 1.0,
+        stiffness_table: StiffnessTable = "tuned",
         on_take: Callable[[Take], None] | None = None,
     ) -> DemoReport:
         """Record scripted demonstrations of seeds `seed` .. `seed + episodes - 1`.
 
+        `stiffness_table` says what the stiffness modes mean.
         More than one worker means processes: a script that calls this needs the usual
         `if __name__ == "__main__"`.
         """
@@ -82,9 +86,10 @@ class Studio:
             raise ValueError(f"Episodes and workers must be at least 1, not {episodes} and {workers}.")
         tasks.load(task)  # an unknown task is refused before anything starts
         seeds = list(range(seed, seed + episodes))
+        config = ServoConfig.for_table(stiffness_table)
         takes: list[Take] = []
         images = "yes" if cameras else "no"
-        for batch, camera_error in self._demonstrations(task, seeds, cameras, workers, spread):
+        for batch, camera_error in self._demonstrations(task, seeds, cameras, workers, spread, config):
             images = camera_error or images
             for take in batch:
                 self.catalog.add(take.path)
@@ -170,15 +175,21 @@ class Studio:
         return self.catalog.rebuild()
 
     def _demonstrations(
-        self, task: str, seeds: list[int], cameras: bool, workers: int, spread: float
+        self,
+        task: str,
+        seeds: list[int],
+        cameras: bool,
+        workers: int,
+        spread: float,
+        config: ServoConfig,
     ) -> Iterator[tuple[Sequence[Take], str | None]]:
         if workers == 1:
-            with Station(task, self.data_dir, cameras=cameras) as station:
+            with Station(task, self.data_dir, cameras=cameras, config=config) as station:
                 for seed in seeds:
                     yield [_demonstrate(station, seed, spread)], station.camera_error
             return
         with ProcessPoolExecutor(
-            workers, get_context("spawn"), _open_station, (task, self.data_dir, cameras)
+            workers, get_context("spawn"), _open_station, (task, self.data_dir, cameras, config)
         ) as pool:
             for done in as_completed([pool.submit(_demonstrate_here, seed, spread) for seed in seeds]):
                 take, camera_error = done.result()
@@ -188,9 +199,9 @@ class Studio:
 _station: Station  # of a worker process
 
 
-def _open_station(task: str, data_dir: Path, cameras: bool) -> None:
+def _open_station(task: str, data_dir: Path, cameras: bool, config: ServoConfig) -> None:
     global _station
-    _station = Station(task, data_dir, cameras=cameras)
+    _station = Station(task, data_dir, cameras=cameras, config=config)
 
 
 def _demonstrate_here(seed: int, spread: float) -> tuple[Take, str | None]:

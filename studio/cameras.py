@@ -39,13 +39,18 @@ PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
 class CameraProcess:
     """The child of one task's scene. Not for two threads at once."""
 
-    def __init__(self, task: str, height: int = HEIGHT, width: int = WIDTH) -> None:
-        """Start it with the first OpenGL that works. Raises RuntimeError with what to install."""
+    def __init__(
+        self, task: str, height: int = HEIGHT, width: int = WIDTH, *, hide_objects: bool = False
+    ) -> None:
+        """Start it with the first OpenGL that works. Raises RuntimeError with what to install.
+
+        `hide_objects` leaves out what is painted and the objects that no hand holds at the start.
+        """
         self.names = tuple(view.name for view in tasks.load(task).cameras)
         self._shape = (height, width, 3)
         reasons = []
         for backend in BACKENDS:
-            self._child = _start(task, height, width, backend)
+            self._child = _start(task, height, width, hide_objects, backend)
             try:
                 self._read(len(READY), START_TIMEOUT)
                 return
@@ -121,9 +126,10 @@ class _Child(subprocess.Popen[bytes]):
     stderr: IO[bytes]
 
 
-def _start(task: str, height: int, width: int, backend: str) -> _Child:
+def _start(task: str, height: int, width: int, hide_objects: bool, backend: str) -> _Child:
+    hidden = ["--hide-objects"] if hide_objects else []
     return _Child(
-        [sys.executable, "-m", "studio.rendering", task, str(height), str(width)],
+        [sys.executable, "-m", "studio.rendering", task, str(height), str(width), *hidden],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -132,15 +138,22 @@ def _start(task: str, height: int, width: int, backend: str) -> _Child:
 
 
 class RenderedCameras:
-    """Images at 20 Hz of simulated time, rendered while the robot waits: for runs that are not live."""
+    """Images at 20 Hz of simulated time, rendered while the robot waits: for runs that are not live.
 
-    def __init__(self, task: str, height: int = HEIGHT, width: int = WIDTH) -> None:
+    `hide_objects` as in `CameraProcess`: a control of whether an agent needs to see them.
+    """
+
+    def __init__(
+        self, task: str, height: int = HEIGHT, width: int = WIDTH, *, hide_objects: bool = False
+    ) -> None:
         self.error: str | None = None  # why there are no images any more
         self._images: Mapping[str, Image] = {}
         self._texture: Array = np.empty(0)
         self._due = 0.0
         try:
-            self._process: CameraProcess | None = CameraProcess(task, height, width)
+            self._process: CameraProcess | None = CameraProcess(
+                task, height, width, hide_objects=hide_objects
+            )
         except RuntimeError as error:
             self._process, self.error = None, str(error)
 

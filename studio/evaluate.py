@@ -12,7 +12,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
@@ -20,52 +22,140 @@ from typing import Any, Literal
 import numpy as np
 
 from controller.types import ARM_ROW, Action, Array, CartesianTarget, Observation, Step
+from policy.agent import ChunkExecutor, ExecutionMode, PolicySpec, load_policy, read_spec
 from studio import tasks
 from studio.evaluation import Curves, Evaluation, Rollout
+from studio.inputs.policy import Immediate, PolicyAgent
+from studio.policy_link import connect_to, is_address
 from studio.recorder import new_episode_id, versions
 from studio.references import REFERENCES
 from studio.session import CONTROL_PERIOD, Agent
 from studio.station import CONTACT, Station, Take
 from studio.twin import Twin
 
+_MakeAgent = Callable[[Twin], Agent]
+
 HELD_SUCCESS = 0.5  # [s] for which success must hold to end a rollout
 CURVE_EVERY = 5  # ticks between two points of a curve: 20 Hz
 
 
-Hidden = Literal["images", "wrench"]
-Execution = Literal["replan", "ensemble"]
+Hidden = Literal["images", "objects", "wrench"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """What is evaluated. Two plans of the same task, seeds and spread meet the same scenes."""
 
-    agent: str  # one of `REFERENCES`
+    agent: str  # one of `REFERENCES`, a run's or checkpoint's folder, or ws://HOST:PORT of a policy server
     task: str
     seeds: tuple[int, ...]
+    spec: PolicySpec | None = None  # of a policy
+    # What a policy is not shown: its images or wrenches (their training mean instead), or in the images the
+    # painted marks and the objects that no hand holds at the start.
+    hide: tuple[Hidden, ...] = ()
+    execution: ExecutionMode = "replan"
+    replan_every: int | None = None  # steps of a chunk, see `ChunkExecutor`
+    latency: float = 0.02  # [s] between a question and its answer, in simulated time
+    device: str = "cpu"
     spread: float = 1.0
     cameras: bool = False  # record images although the agent needs none
 
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
             raise ValueError(f"An evaluation needs different seeds from 0 on, not {list(self.seeds)}.")
-        if self.agent not in REFERENCES:
-            raise KeyError(f"No agent {self.agent!r}; there are {sorted(REFERENCES)}.")
-        tasks.load(self.task)  # an unknown one is refused
+        task = tasks.load(self.task)  # an unknown one is refused
+        if self.spec is None:
+            if self.agent not in REFERENCES:
+                raise KeyError(f"No agent {self.agent!r}; there are {sorted(REFERENCES)}.")
+            if self.hide:
+                raise ValueError(f"Nothing can be hidden from {self.agent!r}: it is no policy.")
+            return
+        self.spec.check(self.task, [arm.name for arm in task.arms], [view.name for view in task.cameras])
+        ChunkExecutor(self.execution, self.replan_every, n_arms=len(task.arms))  # refuses what it cannot do
+        if self.replan_every is not None and self.replan_every > self.spec.chunk:
+            raise ValueError(f"{self.run} tells {self.spec.chunk} steps; it cannot be asked less often.")
+        if is_address(self.agent) and {"images", "wrench"} & set(self.hide):
+            raise ValueError("Hide images or wrenches where the policy runs: studio policy-server … --hide.")
+
+    @staticmethod
+    def of(agent: str, task: str | None, seeds: Sequence[int], data_dir: Path, **settings: Any) -> Plan:
+        """For a reference, a policy server, a folder, or the name of a run in `data_dir`.
+
+        A policy's task need not be told. `settings` are further fields.
+        """
+        spec, wanted = None, agent
+        if agent not in REFERENCES:
+            if is_address(agent):
+                with closing(connect_to(agent)) as policy:
+                    spec = policy.spec
+            else:
+                wanted = str(folder_of(agent, data_dir))
+                spec = read_spec(Path(wanted))
+        if task is None and spec is None:
+            raise ValueError(f"Tell the task that {agent!r} shall do; there are {tasks.names()}.")
+        return Plan(
+            agent=wanted, task=task or (spec.task if spec else ""), seeds=tuple(seeds), spec=spec, **settings
+        )
 
     @property
     def run(self) -> str:
         """The agent's name."""
-        return self.agent
-
-    def opened(self) -> Callable[[Twin], Agent]:
-        """What makes an agent for a twin that has just been reset. Once per process: a policy is loaded."""
-        return REFERENCES[self.agent]
+        return self.spec.run if self.spec else self.agent
 
     @property
     def provenance(self) -> dict[str, Any]:
         """What a rollout's header tells of its agent."""
-        return {"run": self.run}
+        if self.spec is None:
+            return {"run": self.run}
+        executor = ChunkExecutor(self.execution, self.replan_every, n_arms=len(self.spec.arms))
+        return {
+            "run": self.run,
+            "step": self.spec.step,
+            "execution": self.execution,
+            "replan_every": executor.replan_every,
+            "hidden": list(self.hide),
+            "latency_s": self.latency,
+        }
+
+    @property
+    def sees(self) -> bool:
+        """Whether the agent needs images."""
+        return self.spec is not None and bool(self.spec.cameras)
+
+    def station(self, data_dir: Path) -> Station:
+        """Where the agent is rolled out."""
+        return Station(
+            self.task, data_dir, cameras=self.cameras or self.sees, hide_objects="objects" in self.hide
+        )
+
+    def opened(self) -> Callable[[Twin], Agent]:
+        """What makes an agent for a twin that has just been reset. Loads a policy, so once per process."""
+        if self.spec is None:
+            return REFERENCES[self.agent]
+        policy = (
+            connect_to(self.agent)
+            if is_address(self.agent)
+            else load_policy(
+                Path(self.agent),
+                device=self.device,
+                hide_images="images" in self.hide,
+                hide_wrench="wrench" in self.hide,
+            )
+        )
+        mind = Immediate(policy, self.latency)
+        return lambda twin: PolicyAgent(mind, self.execution, self.replan_every, seed=twin.seed)
+
+
+def folder_of(agent: str, data_dir: Path) -> Path:
+    """Of a run or checkpoint, by path or by the name of a run."""
+    for folder in (Path(agent), data_dir / "runs" / agent):
+        if folder.is_dir():
+            return folder
+    runs = sorted(folder.name for folder in (data_dir / "runs").glob("*/"))
+    raise KeyError(
+        f"No agent {agent!r}: neither a folder, nor among the runs {runs or 'of ' + str(data_dir)} and the "
+        f"references {sorted(REFERENCES)}."
+    )
 
 
 @dataclass(slots=True)
@@ -131,7 +221,7 @@ def evaluate(
         done.append(one)
         on_rollout(one.rollout, one.path)
     done.sort(key=lambda one: one.rollout.seed)
-    asked = "yes" if plan.cameras else "no"
+    asked = "yes" if plan.cameras or plan.sees else "no"
     evaluation = Evaluation(
         evaluation_id=evaluation_id,
         started=started,
@@ -151,10 +241,10 @@ def evaluate(
 def _rollouts(plan: Plan, data_dir: Path, evaluation_id: str, workers: int) -> Iterator[_Done]:
     """In the order in which they end."""
     if workers == 1:
-        with Station(plan.task, data_dir, cameras=plan.cameras) as station:
-            make_agent = plan.opened()
+        with plan.station(data_dir) as station:
+            opened = cache(plan.opened)
             for seed in plan.seeds:
-                yield _roll_out(station, make_agent, plan, evaluation_id, seed)
+                yield _roll_out(station, opened, plan, evaluation_id, seed)
         return
     with ProcessPoolExecutor(
         min(workers, len(plan.seeds)), get_context("spawn"), _prepare, (plan, data_dir, evaluation_id)
@@ -168,12 +258,21 @@ def _rollouts(plan: Plan, data_dir: Path, evaluation_id: str, workers: int) -> I
 
 
 def _roll_out(
-    station: Station, make_agent: Callable[[Twin], Agent], plan: Plan, evaluation_id: str, seed: int
+    station: Station, opened: Callable[[], _MakeAgent], plan: Plan, evaluation_id: str, seed: int
 ) -> _Done:
     feel, begun = Feel(), time.monotonic()
+    agent: Agent | None = None
+
+    def make_agent(twin: Twin) -> Agent:
+        nonlocal agent
+        if plan.sees and station.camera_error:
+            raise RuntimeError(station.camera_error)
+        agent = opened()(twin)
+        return UntilDone(agent, twin)
+
     try:
         take = station.record(
-            lambda twin: UntilDone(make_agent(twin), twin),
+            make_agent,
             agent_name=plan.run,
             operator="evaluation",
             seed=seed,
@@ -181,13 +280,16 @@ def _roll_out(
             subscribers=[feel],
             provenance={"evaluation": evaluation_id, **plan.provenance},
         )
+        if plan.sees and station.camera_error:
+            raise RuntimeError(station.camera_error)
     except Exception as error:  # whatever stops one rollout must neither stop nor colour the others
         return _Done(Rollout(seed, False, error=f"{type(error).__name__}: {error}"))
-    rollout = _rollout_of(take, feel, time.monotonic() - begun)
+    late = agent.late if isinstance(agent, PolicyAgent) else 0
+    rollout = _rollout_of(take, feel, time.monotonic() - begun, late)
     return _Done(rollout, take.path, feel, station.camera_error)
 
 
-def _rollout_of(take: Take, feel: Feel, wall_seconds: float) -> Rollout:
+def _rollout_of(take: Take, feel: Feel, wall_seconds: float, late: int) -> Rollout:
     felt = np.max(feel.force, axis=1) if feel.force else np.zeros(0)
     contact = felt[felt > CONTACT]
     progress = take.ending.progress
@@ -206,6 +308,7 @@ def _rollout_of(take: Take, feel: Feel, wall_seconds: float) -> Rollout:
         force_max_N=feel.peak,
         impulse_Ns=float(contact.sum()) * CONTROL_PERIOD,
         limits=take.limits,
+        late_ticks=late,
     )
 
 
@@ -237,13 +340,13 @@ def _curve(forces: Sequence[Array], stiffnesses: Sequence[Array]) -> Curves:
 
 # A worker process
 
-_worker: tuple[Station, Callable[[Twin], Agent], Plan, str]
+_worker: tuple[Station, Callable[[], _MakeAgent], Plan, str]
 
 
 def _prepare(plan: Plan, data_dir: Path, evaluation_id: str) -> None:
     global _worker
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers share the cores; read when torch is loaded
-    _worker = Station(plan.task, data_dir, cameras=plan.cameras), plan.opened(), plan, evaluation_id
+    _worker = plan.station(data_dir), cache(plan.opened), plan, evaluation_id
 
 
 def _roll_out_here(seed: int) -> _Done:

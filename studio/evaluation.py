@@ -33,6 +33,7 @@ class Rollout:
     force_max_N: float = 0.0  # over all fast steps
     impulse_Ns: float = 0.0
     limits: tuple[str, ...] = ()  # kinds of limits that acted
+    late_ticks: int = 0  # for which a policy had no word, and its last target was held
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +92,7 @@ class Evaluation:
             "contact_seconds_mean": round(_mean(r.contact_seconds for r in judged), 4),
             "seconds_per_episode": round(_mean(r.seconds for r in judged), 3),
             "wall_seconds_per_episode": round(_mean(r.wall_seconds for r in judged), 3),
+            "late_ticks": sum(r.late_ticks for r in judged),
             "spread": self.spread,
             "seeds": [r.seed for r in self.rollouts],
             "ids": [r.episode_id for r in judged],

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from controller.servo import ServoConfig
-from controller.stiffness import nearest_mode
+from controller.stiffness import StiffnessTable, nearest_mode
 from controller.types import Limit, Pose, Step, StiffnessMode
 from studio import messages as m
 from studio import tasks
@@ -55,10 +55,19 @@ log = logging.getLogger(__name__)
 class LiveSession:
     """The loop and what it owns. `run` is its thread; everything else reaches it through the hub."""
 
-    def __init__(self, data_dir: Path, task: str, hub: Hub, *, seed: int = 0, cameras: bool = True) -> None:
+    def __init__(
+        self,
+        data_dir: Path,
+        task: str,
+        hub: Hub,
+        *,
+        seed: int = 0,
+        cameras: bool = True,
+        config: ServoConfig | None = None,
+    ) -> None:
         self._hub = hub
         self._with_cameras = cameras
-        self._config = ServoConfig()
+        self._config = config or ServoConfig()
         self._clock = Clock(CONTROL_PERIOD)
         self._resets = 0  # how often a scene was put on the stage
         self._robot: Twin
@@ -425,7 +434,13 @@ def _ownership(path: Path) -> Iterator[None]:
         yield
 
 
-def main(data: Path, task: str = "wiping", seed: int = 0, cameras: bool = True) -> None:
+def main(
+    data: Path,
+    task: str = "wiping",
+    seed: int = 0,
+    cameras: bool = True,
+    stiffness_table: StiffnessTable = "tuned",
+) -> None:
     """Run the session process of a data folder.
 
     Args:
@@ -433,6 +448,7 @@ def main(data: Path, task: str = "wiping", seed: int = 0, cameras: bool = True) 
         task: What is on the stage first.
         seed: Of the first scene.
         cameras: Render images.
+        stiffness_table: What the stiffness modes mean, see controller/stiffness.py.
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -440,7 +456,8 @@ def main(data: Path, task: str = "wiping", seed: int = 0, cameras: bool = True) 
     with _ownership(path):
         hub = Hub(path)
         try:
-            session = LiveSession(data.absolute(), task, hub, seed=seed, cameras=cameras)
+            config = ServoConfig.for_table(stiffness_table)
+            session = LiveSession(data.absolute(), task, hub, seed=seed, cameras=cameras, config=config)
             _end_on_signal(lambda: hub.commands.post(m.Shutdown()))
             _claim_priority()
             gc.collect()

@@ -1,8 +1,8 @@
 """The camera process: positions and painted textures in, JPEGs and pixels out.
 
-`python -m studio.rendering TASK HEIGHT WIDTH` reads requests from standard input until it ends. Each is the
-head `REQUEST`, float64 positions and, where it has changed, the painted texture; the answer is, for each
-camera, the head `ANSWER`, a JPEG and, where asked for, the RGB pixels.
+`python -m studio.rendering TASK HEIGHT WIDTH [--hide-objects]` reads requests from standard input until it
+ends. Each is the head `REQUEST`, float64 positions and, where it has changed, the painted texture; the answer
+is, for each camera, the head `ANSWER`, a JPEG and, where asked for, the RGB pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ READY = b"ready\n"
 JPEG_QUALITY = 90
 
 
-def main(task_name: str, height: int, width: int) -> None:
+def main(task_name: str, height: int, width: int, hide_objects: bool = False) -> None:
     """Answer requests until standard input ends."""
     from studio import tasks
     from studio.twin import build_model
@@ -33,6 +33,9 @@ def main(task_name: str, height: int, width: int) -> None:
     model = build_model(task)
     data = mujoco.MjData(model)
     painted = task.texture()
+    if hide_objects:
+        painted = None
+        _hide_objects(model, [arm.grasp.body for arm in task.arms if arm.grasp])
     requests = sys.stdin.buffer
     with mujoco.Renderer(model, height, width) as renderer:
         answers.write(READY)
@@ -40,8 +43,9 @@ def main(task_name: str, height: int, width: int) -> None:
         while len(head := requests.read(REQUEST.size)) == REQUEST.size:
             n_positions, n_texture, want_pixels = REQUEST.unpack(head)
             data.qpos[:] = np.frombuffer(requests.read(n_positions))
-            if n_texture and painted:
-                _upload(renderer, model, painted[0], requests.read(n_texture))
+            texture = requests.read(n_texture)
+            if texture and painted:
+                _upload(renderer, model, painted[0], texture)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
@@ -54,6 +58,14 @@ def main(task_name: str, height: int, width: int) -> None:
             answers.flush()
 
 
+def _hide_objects(model: mujoco.MjModel, held: list[str]) -> None:
+    """Make every free body transparent but those that a hand holds from the start."""
+    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    hidden = [body for body in free if model.body(int(body)).name not in held]
+    # Whatever hangs on a free body has it as its root.
+    model.geom_rgba[np.isin(model.body_rootid[model.geom_bodyid], hidden), 3] = 0.0
+
+
 def _upload(renderer: mujoco.Renderer, model: mujoco.MjModel, name: str, pixels: bytes) -> None:
     texture = model.texture(name).id
     start = model.tex_adr[texture]
@@ -63,4 +75,4 @@ def _upload(renderer: mujoco.Renderer, model: mujoco.MjModel, name: str, pixels:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), "--hide-objects" in sys.argv[4:])

@@ -25,6 +25,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import rich
 
+from controller.stiffness import StiffnessTable
 from studio import tasks
 from studio.api import Studio
 from studio.link import socket_path
@@ -52,8 +53,11 @@ class AlreadyServed(RuntimeError):
 class SessionProcess:
     """The session process of a data folder: found running, or started here in a process group of its own."""
 
-    def __init__(self, data_dir: Path, task: str, *, cameras: bool = True) -> None:
+    def __init__(
+        self, data_dir: Path, task: str, *, cameras: bool = True, stiffness_table: StiffnessTable = "tuned"
+    ) -> None:
         self._data_dir, self._task, self._cameras = data_dir, task, cameras
+        self._stiffness_table: StiffnessTable = stiffness_table
         self._socket = socket_path(data_dir)
         self._child: subprocess.Popen[bytes] | None = None
         self.pid: int | None = None  # of the one that we talked to last
@@ -74,6 +78,7 @@ class SessionProcess:
         log_file.parent.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, "-m", "studio.live", "--data", str(self._data_dir)]
         command += ["--task", task or self._task, "--seed", str(seed)]
+        command += ["--stiffness-table", self._stiffness_table]
         command += [] if self._cameras else ["--no-cameras"]
         with log_file.open("ab") as file:
             self._child = subprocess.Popen(
@@ -130,6 +135,7 @@ def serve(
     task: str = "wiping",
     *,
     cameras: bool = True,
+    stiffness_table: StiffnessTable = "tuned",
     open_page: bool = False,
     tell: Callable[[str], None] = print,
 ) -> None:
@@ -147,7 +153,7 @@ def serve(
         studio = stack.enter_context(Studio(data_dir))
         for recovery in studio.recover():
             tell(recovery.what)
-        process = SessionProcess(data_dir, task, cameras=cameras)
+        process = SessionProcess(data_dir, task, cameras=cameras, stiffness_table=stiffness_table)
         viewer = start_viser()
         stack.callback(_stop, viewer)
         page = Page(viewer, studio, process)

@@ -62,10 +62,17 @@ class Station:
     """Owns one twin. Use it in a `with`: its cameras are a process."""
 
     def __init__(
-        self, task: str, data_dir: Path, *, cameras: bool = True, config: ServoConfig | None = None
+        self,
+        task: str,
+        data_dir: Path,
+        *,
+        cameras: bool = True,
+        hide_objects: bool = False,
+        config: ServoConfig | None = None,
     ) -> None:
+        """`hide_objects` from the cameras: see `RenderedCameras`."""
         self._scene = tasks.load(task)
-        self._cameras = RenderedCameras(task) if cameras else None
+        self._cameras = RenderedCameras(task, hide_objects=hide_objects) if cameras else None
         self._recorder = Recorder(data_dir)
         self.twin = Twin(self._scene, config, self._cameras)
 

@@ -68,7 +68,7 @@ class Twin:
         self.config = config or ServoConfig()
         self.model = build_model(task)
         self.data = mujoco.MjData(self.model)
-        self.world = World(self.model, self.data, task.arms)
+        self.world = World(self.model, self.data, task.arms, self.config.stiffness_table)
         self.arms = tuple(_Arm(i, setup, self.world, self.config) for i, setup in enumerate(task.arms))
         self.seed = 0
         self.spread = 1.0

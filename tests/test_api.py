@@ -16,7 +16,7 @@ import pytest
 from agents import Script
 from mcap.reader import make_reader
 
-from controller.types import Action, ArmAction, CartesianTarget, Hold, JointTarget, Pose, Release
+from controller.types import Action, ArmAction, CartesianTarget, Hold, JointTarget, Pose, Release, Stiffness
 from studio.api import DemoReport, Studio
 from studio.catalog import edits_path
 from studio.episode import open_episode
@@ -81,6 +81,18 @@ def test_a_demo_reports_what_it_recorded(recorded: tuple[Path, DemoReport]) -> N
         assert sorted(row.episode_id for row in rows) == sorted(report.ids)
         assert {row.seed for row in rows} == {7, 8}
         assert sum(row.duration for row in rows) == pytest.approx(report.simulated_seconds, abs=0.1)
+
+
+def test_the_papers_stiffness_can_be_chosen_stands_in_the_take_and_replays(tmp_path: Path) -> None:
+    with Studio(tmp_path) as studio:
+        report = studio.demo("wiping", seed=7, cameras=False, stiffness_table="literal")
+        assert report.successes == 1
+        with studio.open(report.ids[0]) as episode:
+            assert episode.header.control["servo"]["stiffness_table"] == "literal"
+            column = episode.columns("right/applied")["right/applied/stiffness"]
+            diagonals = [Stiffness.from_vector(row).diagonals for row in np.unique(column, axis=0)]
+        np.testing.assert_array_equal(diagonals, [[250.0] * 6, [500.0] * 6])
+        assert studio.replay(report.ids[0]).is_exact
 
 
 def test_a_take_replays_to_the_bit(recorded: tuple[Path, DemoReport]) -> None:

@@ -169,3 +169,27 @@ def _wait(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+@pytest.mark.parametrize("name", ["wiping", "bimanual-wiping"])
+def test_hidden_objects_and_marks_are_not_seen(rendered: RenderedCameras, name: str) -> None:
+    twin, scenes = Twin(tasks.load(name)), []
+    for seed in (1, 2):
+        twin.reset(seed)
+        painted = twin.task.texture()
+        scenes.append((twin.data.qpos.copy(), None if painted is None else painted[1].copy()))
+    # The arms and what they hold are seen in both, so they must be in the same place.
+    held = {arm.grasp.body for arm in twin.task.arms if arm.grasp}
+    first, second = scenes[0][0], scenes[1][0].copy()
+    for joint in range(twin.model.njnt):
+        body = twin.model.body(int(twin.model.jnt_bodyid[joint])).name
+        start = int(twin.model.jnt_qposadr[joint])
+        end = int(twin.model.jnt_qposadr[joint + 1]) if joint + 1 < twin.model.njnt else twin.model.nq
+        if twin.model.jnt_type[joint] != 0 or body in held:
+            second[start:end] = first[start:end]
+    for hide in (False, True):
+        cameras = CameraProcess(name, 60, 80, hide_objects=hide)
+        one = cameras.render(0.0, first, scenes[0][1])["front"].pixels
+        other = cameras.render(0.0, second, scenes[1][1])["front"].pixels
+        cameras.close()
+        assert np.array_equal(one, other) == hide

@@ -9,15 +9,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from policies import SPEC, Riser
+from safetensors.torch import save
 from scipy.stats import binomtest
 
 from controller.model import ur5e
 from controller.types import Action, CartesianTarget, JointTarget, Observation
-from studio import references
+from policy.act import Act
+from policy.agent import History, Inputs, Policy, load_policy
+from policy.checkpoint import MODEL, Checkpoint, write
+from policy.config import TrainConfig
+from policy.features import Encoding, Features, Scale
+from studio import references, tasks
 from studio.api import Studio
 from studio.evaluate import Plan
 from studio.evaluation import Evaluation, compare, load, mcnemar, wilson
+from studio.policy_link import TOKEN, PolicyServer, start
 from studio.references import REFERENCES, demonstrated, smooth_errors
+from studio.tasks import wiping
 from studio.twin import Twin
 
 KEYS = {
@@ -58,13 +67,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def demonstrator(data: Path) -> Evaluation:
     with Studio(data) as studio:
-        return studio.evaluate(Plan("demonstrator", "wiping", (1000, 1001)))
+        return studio.evaluate(Plan(agent="demonstrator", task="wiping", seeds=(1000, 1001)))
 
 
 @pytest.fixture(scope="module")
 def joint(data: Path) -> Evaluation:
     with Studio(data) as studio:
-        return studio.evaluate(Plan("off-joint", "wiping", (1000, 1001)))
+        return studio.evaluate(Plan(agent="off-joint", task="wiping", seeds=(1000, 1001)))
 
 
 def actions_of(twin: Twin, reference: str, seed: int) -> list[Action]:
@@ -165,7 +174,7 @@ def test_only_the_same_scenes_are_compared(demonstrator: Evaluation) -> None:
 def test_errors_are_not_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(REFERENCES, "faulty", Faulty)
     with Studio(tmp_path) as studio:
-        found = studio.evaluate(Plan("faulty", "wiping", (0, 1, 2, 3)))
+        found = studio.evaluate(Plan(agent="faulty", task="wiping", seeds=(0, 1, 2, 3)))
         summary = found.summary()
         assert summary["episodes"] == 2
         assert summary["failed_seeds"] == [0, 2]
@@ -174,14 +183,99 @@ def test_errors_are_not_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert len(studio.episodes(outcome="unmarked")) == 2
 
 
-def test_bad_plans_are_refused() -> None:
+def test_bad_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="demonstrator"):
-        Plan("demonstrater", "wiping", (0,))
+        Plan.of("demonstrater", "wiping", (0,), tmp_path)
     with pytest.raises(KeyError, match="wiping"):
-        Plan("demonstrator", "whiping", (0,))
+        Plan.of("demonstrator", "whiping", (0,), tmp_path)
+    with pytest.raises(ValueError, match="Tell the task"):
+        Plan.of("demonstrator", None, (0,), tmp_path)
+    with pytest.raises(ValueError, match="no policy"):
+        Plan.of("demonstrator", "wiping", (0,), tmp_path, hide=("images",))
     for seeds in ((), (1, 1), (-1,)):
         with pytest.raises(ValueError, match="seeds"):
-            Plan("demonstrator", "wiping", seeds)
+            Plan.of("demonstrator", "wiping", seeds, tmp_path)
+    spec = dataclasses.replace(SPEC, cameras={"left_wrist": (96, 96)})
+    for settings, words in (
+        ({"task": "drawing"}, "learned 'wiping'"),
+        ({"spec": spec}, "left_wrist"),
+        ({"replan_every": 21}, "20 steps"),
+        ({"agent": "ws://localhost:1", "hide": ("wrench",)}, "where the policy runs"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Plan(**{"agent": "riser", "task": "wiping", "seeds": (0,), "spec": SPEC, **settings})
+
+
+# Policies
+
+
+def test_a_policy_of_another_process_is_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(TOKEN, "open sesame")
+    monkeypatch.setattr(wiping.Task, "time_limit", 3.0)
+    with PolicyServer(Riser(), "open sesame") as server, Studio(tmp_path) as studio:
+        plan = Plan.of(server.address, None, (4,), tmp_path, latency=0.05, replan_every=18)
+        found = studio.evaluate(plan)
+        summary = found.summary()
+        assert (summary["run"], summary["task"], summary["step"]) == ("riser", "wiping", 7)
+        assert (summary["successes"], summary["episodes"]) == (0, 1)
+        assert summary["late_ticks"] == 0  # a chunk of .95 s, asked for every .9 s, answered after .05 s
+        assert summary["seconds_per_episode"] == 3.0
+        with studio.open(summary["ids"][0]) as episode:
+            assert episode.header.agent == "riser"
+            assert episode.header.provenance == {
+                "evaluation": found.evaluation_id,
+                "run": "riser",
+                "step": 7,
+                "execution": "replan",
+                "replan_every": 18,
+                "hidden": [],
+                "latency_s": 0.05,
+            }
+
+
+def test_a_run_is_evaluated_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also that what is hidden is hidden, and that a process of its own answers the same."""
+    monkeypatch.setattr(wiping.Task, "time_limit", 1.0)
+    run = untrained(tmp_path / "runs" / "blank")
+    with Studio(tmp_path) as studio:
+        plan = Plan.of("blank", None, (4,), tmp_path)
+        found = studio.evaluate(dataclasses.replace(plan, hide=("wrench",)))
+        assert found.summary()["errors"] == {}
+        assert found.summary()["hidden"] == ["wrench"]
+    twin = Twin(tasks.load("wiping"))
+    twin.reset(3)
+    history = History(plan.spec)
+    history.add(observation := twin.observe())
+    inputs = history.inputs(observation)
+    assert inputs is not None
+    pressed = dataclasses.replace(inputs, wrench=inputs.wrench + 10.0)
+
+    def height(policy: Policy, seen: Inputs) -> float:
+        return float(policy.predict(seen).arms[0].position[-1, 2])
+
+    seeing, blind = load_policy(run), load_policy(run, hide_wrench=True)
+    assert height(seeing, inputs) != height(seeing, pressed)
+    assert height(blind, inputs) == height(blind, pressed)
+    remote = start(run)
+    assert remote.spec == seeing.spec
+    assert height(remote, pressed) == height(seeing, pressed)
+    remote.close()
+    with pytest.raises(RuntimeError, match="no checkpoint"):
+        start(tmp_path)
+
+
+def untrained(run: Path) -> Path:
+    """A run whose network has learned nothing, and sees nothing but itself and forces."""
+    config = TrainConfig(width=16, feedforward=32, heads=2, images=False)
+    encoding = Encoding(1, "cartesian", config.frame, config.rotation, config.stiffness)
+    unit = [Scale(np.zeros(n), np.ones(n)) for n in (encoding.state_width, encoding.action_width, 6)]
+    spec = dataclasses.replace(SPEC, run=run.name, chunk=config.chunk, wrench_history=config.wrench_history)
+    checkpoint = Checkpoint(spec, config, Features(encoding, *unit), {}, "none")
+    tensors = {
+        name: tensor.contiguous() for name, tensor in Act.of(config, encoding, {}).state_dict().items()
+    }
+    write(run, checkpoint, {MODEL: save(tensors)}, is_best=True)
+    return run
 
 
 # References

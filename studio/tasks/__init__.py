@@ -16,6 +16,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+from controller.stiffness import StiffnessTable
 from controller.types import Action, Array, Pose, StiffnessMode, quaternion_from_rotation_vector
 
 
@@ -85,6 +86,7 @@ class World:
     model: mujoco.MjModel
     data: mujoco.MjData
     arms: tuple[ArmSetup, ...]
+    table: StiffnessTable = "tuned"  # of the modes that a demonstrator switches between
 
     def pose(self, body: str) -> Pose:
         """world_from_body."""

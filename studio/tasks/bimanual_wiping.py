@@ -219,7 +219,7 @@ class Task:
         speed = rng.uniform(0.85, 1.2)
         home = [world.tcp(arm.name) for arm in self.arms]
         left, right = hands = [
-            Motion(pose, StiffnessMode.MEDIUM, gripper, speed=speed, base=arm.base_position)
+            Motion(pose, StiffnessMode.MEDIUM, gripper, world.table, speed, arm.base_position)
             for pose, gripper, arm in zip(home, (1.0, 0.0), self.arms, strict=True)
         ]
         error = rng.uniform(-GRASP_ERROR, GRASP_ERROR)

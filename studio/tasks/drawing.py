@@ -185,7 +185,8 @@ class Task:
         """Three strokes, then home."""
         style = STYLES[rng.integers(len(STYLES))]
         home = world.tcp("right")
-        hand = Motion(home, StiffnessMode.MEDIUM, gripper=0.0, speed=rng.uniform(0.85, 1.2))
+        speed = rng.uniform(0.85, 1.2)
+        hand = Motion(home, StiffnessMode.MEDIUM, gripper=0.0, table=world.table, speed=speed)
         eyes_and_mouth = list(smile())
         if style.backwards:
             eyes_and_mouth[2] = eyes_and_mouth[2][::-1]

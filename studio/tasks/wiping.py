@@ -143,7 +143,8 @@ class Task:
         """Hover beside the mark, descend, press at low stiffness, one pass along the line, lift, home."""
         style = STYLES[rng.integers(len(STYLES))]
         home = world.tcp("right")
-        hand = Motion(home, StiffnessMode.MEDIUM, gripper=0.0, speed=rng.uniform(0.85, 1.2))
+        speed = rng.uniform(0.85, 1.2)
+        hand = Motion(home, StiffnessMode.MEDIUM, gripper=0.0, table=world.table, speed=speed)
 
         def jitter(scale: float) -> Array:
             return np.asarray(rng.normal(0.0, scale, 3) * np.array([1.0, 1.0, 0.3]))
