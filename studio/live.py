@@ -159,9 +159,13 @@ class LiveSession:
     def _execute(self, command: m.Command) -> None:
         match command:
             case m.MoveTo():
-                self._hand(command.arm).move_to(Pose(np.array(command.position), np.array(command.wxyz)))
+                self._hands.move_to(
+                    self._arm(command.arm), Pose(np.array(command.position), np.array(command.wxyz))
+                )
             case m.Nudge():
-                self._hand(command.arm).nudge(step_of(command.translation, command.rotation))
+                self._hands.nudge(self._arm(command.arm), step_of(command.translation, command.rotation))
+            case m.Mirror():
+                self._hands.mirror(command.mirrored)
             case m.Engage():
                 self._engage(command.arm, command.engaged)
             case m.SetMode():
@@ -206,10 +210,14 @@ class LiveSession:
             case _:
                 assert_never(command)
 
-    def _hand(self, arm: int) -> HandOfOperator:
+    def _arm(self, arm: int) -> int:
+        """The arm's index. Raises ValueError where there is none."""
         if not 0 <= arm < len(self._hands.hands):
             raise ValueError(f"No arm {arm}; this task has {len(self._hands.hands)}, counted from 0.")
-        return self._hands.hands[arm]
+        return arm
+
+    def _hand(self, arm: int) -> HandOfOperator:
+        return self._hands.hands[self._arm(arm)]
 
     def _engage(self, arm: int, engaged: bool) -> None:
         hand = self._hand(arm)
@@ -280,7 +288,9 @@ class LiveSession:
         self._robot.reset(seed, spread)
         if self._cameras:
             self._cameras.clear()
+        is_mirrored = self._resets > 0 and self._hands.is_mirrored
         self._hands = OperatorAgent(self._robot.task.arms, self._config.stiffness_table)
+        self._hands.mirror(is_mirrored and len(self._robot.task.arms) == 2)
         self._agent = self._hands
         self._session.inputs = self._hands.timings
         self._resets += 1
@@ -392,6 +402,7 @@ class LiveSession:
             success=progress.success,
             task_phase=progress.phase,
             arms=tuple(arms),
+            mirrored=self._hands.is_mirrored,
             rate=pace.rate,
             late_share=pace.late_share,
             worst_delay=pace.worst,

@@ -71,6 +71,12 @@ class MoveTo(Message, frozen=True, kw_only=True):
     wxyz: tuple[Component, Component, Component, Component]
 
 
+class Mirror(Message, frozen=True, kw_only=True):
+    """Let what moves one of two arms move the other like in a mirror, or no longer."""
+
+    mirrored: bool
+
+
 class Nudge(Message, frozen=True, kw_only=True):
     """Move an arm's target by a step: translation in base axes [m], rotation vector in tool axes [rad]."""
 
@@ -186,6 +192,7 @@ Command = (
     | Drive
     | Engage
     | MoveTo
+    | Mirror
     | Nudge
     | SetMode
     | SwitchMode
@@ -283,6 +290,7 @@ class Status(Message, frozen=True, kw_only=True):
     success: bool
     task_phase: str
     arms: tuple[ArmStatus, ...]
+    mirrored: bool = False  # whether what moves one arm moves the other
     rate: float  # [Hz] of the control loop over the last seconds
     late_share: float  # of the ticks of the last seconds
     worst_delay: float  # [s] of the last seconds

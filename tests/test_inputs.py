@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from controller.stiffness import stiffness_of
 from controller.types import ArmAction, CartesianTarget, Hold, Observation, Pose, Release, StiffnessMode
@@ -52,12 +54,50 @@ def test_a_still_hand_keeps_its_target(operator: OperatorAgent) -> None:
 
 def test_a_nudge_moves_in_base_axes_and_turns_in_tool_axes(operator: OperatorAgent) -> None:
     operator.hands[0].engage(POSE)
-    operator.hands[0].nudge(step_of((0.0, 0.0, -0.01), (0.0, 0.0, 0.1)))
+    operator.nudge(0, step_of((0.0, 0.0, -0.01), (0.0, 0.0, 0.1)))
     moved = target_of(operator).base_from_target  # type: ignore[attr-defined]
     assert moved.position == pytest.approx([0.4, 0.0, 0.19])
     # Tool z points down (-z): a turn about it lowers the yaw in base axes.
     turn = POSE.rotation.T @ moved.rotation
     assert np.arctan2(turn[1, 0], turn[0, 0]) == pytest.approx(0.1)
+
+
+def reflected(pose: Pose) -> Pose:
+    """As a mirror between the arms shows it, axis by axis."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    return Pose.of(mirror @ pose.rotation @ mirror, mirror @ pose.position)
+
+
+def vectors(most: float) -> st.SearchStrategy[tuple[float, float, float]]:
+    return st.tuples(*(st.floats(-most, most) for _ in range(3)))
+
+
+@given(steps=st.lists(st.tuples(st.integers(0, 1), vectors(0.05), vectors(0.5)), max_size=8))
+def test_mirrored_arms_stay_mirror_images_whichever_is_moved(
+    steps: list[tuple[int, tuple[float, float, float], tuple[float, float, float]]],
+) -> None:
+    hands = OperatorAgent(tasks.load("peg-cylinder").arms)
+    hands.hands[0].engage(POSE)
+    hands.hands[1].engage(reflected(POSE))
+    hands.mirror(True)
+    for arm, translation, rotation in steps:
+        hands.nudge(arm, step_of(translation, rotation))
+    left, right = hands.hands[0].target, hands.hands[1].target
+    assert left is not None
+    assert right is not None
+    image = reflected(left)
+    np.testing.assert_allclose(right.position, image.position, atol=1e-9)
+    np.testing.assert_allclose(right.rotation, image.rotation, atol=1e-9)
+
+
+def test_a_parked_arm_sees_no_mirror(operator: OperatorAgent) -> None:
+    hands = OperatorAgent(tasks.load("peg-cylinder").arms)
+    hands.mirror(True)
+    hands.hands[0].engage(POSE)
+    hands.nudge(0, step_of((0.01, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    assert hands.hands[1].target is None
+    with pytest.raises(ValueError, match="two arms; this task has 1"):
+        operator.mirror(True)
 
 
 def test_modes_switch_the_stiffness_and_nothing_else(operator: OperatorAgent) -> None:

@@ -17,6 +17,7 @@ from controller.stiffness import StiffnessTable, stiffness_of
 from controller.types import (
     Action,
     ArmAction,
+    Array,
     CartesianTarget,
     Hold,
     InputTiming,
@@ -54,6 +55,11 @@ class HandOfOperator:
     def engaged(self) -> bool:
         """Whether the arm follows this hand."""
         return self._target is not None
+
+    @property
+    def target(self) -> Pose | None:
+        """base_from_target; None while parked."""
+        return self._target
 
     @property
     def input_age(self) -> float | None:
@@ -153,11 +159,11 @@ class HandOfOperator:
         """[s] since the tracked hand was heard of."""
         return math.inf if self._tracked is None else self._now() - self._tracked.heard
 
-    def nudge(self, step: Pose) -> None:
-        """Move the target by a step: its position in base axes, its rotation in tool axes."""
+    def take_step(self, translation: Array, rotation: Array) -> None:
+        """Move the target by a translation [m] and a rotation (wxyz), both in base axes."""
         if self._target is not None:
-            wxyz = multiply_quaternions(self._target.wxyz, step.wxyz)
-            self.move_to(Pose(self._target.position + step.position, wxyz / np.linalg.norm(wxyz)))
+            wxyz = multiply_quaternions(rotation, self._target.wxyz)
+            self.move_to(Pose(self._target.position + translation, wxyz / np.linalg.norm(wxyz)))
 
     def action(self, table: StiffnessTable) -> ArmAction:
         """What to request now."""
@@ -196,8 +202,30 @@ class OperatorAgent:
     ) -> None:
         self.hands = tuple(HandOfOperator(setup, now) for setup in setups)
         self._names = tuple(setup.name for setup in setups)
+        self.is_mirrored = False  # whether what moves one of two arms moves the other like in a mirror
         self._were_led = [False] * len(setups)
         self._table: StiffnessTable = table
+
+    def mirror(self, is_mirrored: bool) -> None:
+        """Let both arms move like in a mirror, or no longer. Raises ValueError where there are not two."""
+        if is_mirrored and len(self.hands) != 2:
+            raise ValueError(f"A mirror needs two arms; this task has {len(self.hands)}.")
+        self.is_mirrored = is_mirrored
+
+    def move_to(self, arm: int, base_from_target: Pose) -> None:
+        """Set an arm's target, see `HandOfOperator.move_to`; mirrored, the other takes the same step."""
+        hand = self.hands[arm]
+        before = hand.target
+        hand.move_to(base_from_target)
+        if self.is_mirrored and before is not None and hand.target is not None:
+            self.hands[1 - arm].take_step(*_reflected_step(before, hand.target))
+
+    def nudge(self, arm: int, step: Pose) -> None:
+        """Move an arm's target by a step: its position in base axes, its rotation in tool axes."""
+        target = self.hands[arm].target
+        if target is not None:
+            wxyz = multiply_quaternions(target.wxyz, step.wxyz)
+            self.move_to(arm, Pose(target.position + step.position, wxyz / np.linalg.norm(wxyz)))
 
     def reset(self, observation: Observation) -> None:
         """Nothing: hands keep what they want."""
@@ -220,6 +248,16 @@ class OperatorAgent:
                 what = "engaged" if hand.clutch.engaged else hand.clutch.why or "disengaged"
                 told.append(f"{name}: {what}")
         return told
+
+
+def _reflected_step(before: Pose, after: Pose) -> tuple[Array, Array]:
+    """Translation [m] and rotation (wxyz) from one target to the next, in base axes, as a mirror shows them.
+
+    The mirror stands between the arms, upright along x: bases have equal axes and differ along y.
+    """
+    inverse = before.wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+    rotation = multiply_quaternions(after.wxyz, inverse)
+    return (after.position - before.position) * [1.0, -1.0, 1.0], rotation * [1.0, -1.0, 1.0, -1.0]
 
 
 def step_of(translation: tuple[float, float, float], rotation: tuple[float, float, float]) -> Pose:

@@ -15,6 +15,7 @@ from studio.messages import (
     EndTake,
     Engage,
     Judgement,
+    Mirror,
     Notice,
     NoticeKind,
     Nudge,
@@ -114,6 +115,11 @@ class Desk:
     ) -> None:
         """Move the keyboard's arm: base axes [m], tool axes [rad]."""
         self._remote.post(Nudge(arm=self.keyboard_arm, translation=translation, rotation=rotation))
+
+    def toggle_mirror(self) -> None:
+        """Whether what moves one of two arms moves the other like in a mirror."""
+        if status := self.status:
+            self._remote.post(Mirror(mirrored=not status.mirrored))
 
     def switch_keyboard_arm(self) -> None:
         if status := self.status:

@@ -74,6 +74,7 @@ class Hotkeys:
                 Hotkey("P", f"Park or engage the {name} arm", partial(desk.toggle_engaged, arm), shift),
             ]
         if len(names) > 1:
+            keys.append(Hotkey("H", "Mirror: both arms, one hand", desk.toggle_mirror))
             keys.append(Hotkey("T", "Keyboard drives the other arm", desk.switch_keyboard_arm))
         self._of_arms = [self._register(hotkey) for hotkey in keys]
         return self.keys + keys

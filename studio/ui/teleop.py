@@ -93,6 +93,13 @@ class _DriverRows:
         _columns(gui, 4)
         self._buttons = {choice: gui.add_button(LABELS[choice], color=PASSIVE) for choice in CHOICES}
         self._hint = gui.add_html("")
+        self._mirror = gui.add_button(
+            "Mirror",
+            color=PASSIVE,
+            visible=False,
+            hint="What moves one arm moves the other like in a mirror.",
+        )
+        on_click(self._mirror, desk.toggle_mirror)
         keypad.build(gui)
 
         @name.on_update
@@ -108,6 +115,8 @@ class _DriverRows:
             _set_active(button, LABELS[choice], choice == active)
         self._keypad.show(status, visible=active == "keyboard")
         self._hint.content = f'<div class="text dim">{_DRIVER_HINTS[active]}</div>'
+        self._mirror.visible = len(status.arms) == 2 and status.driver == "operator"
+        _set_active(self._mirror, "Mirror both arms (H)", status.mirrored)
 
 
 _DRIVER_HINTS: dict[Choice, str] = {
