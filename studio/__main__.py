@@ -31,10 +31,19 @@ console = Console(width=None if sys.stdout.isatty() else UNLIMITED, markup=False
 errors = Console(stderr=True, markup=False)
 
 
-def show_tasks(json: Json = False) -> int:
-    """List the tasks."""
+def show_tasks(pictures: Path | None = None, json: Json = False) -> int:
+    """List the tasks.
+
+    Args:
+        pictures: Also write what each task's cameras see during a demonstration to this folder.
+    """
     from studio import tasks
 
+    if pictures:
+        from studio.pictures import write_picture
+
+        for name in tasks.names():
+            write_picture(name, pictures / f"{name}.jpg")
     found = [tasks.load(name) for name in tasks.names()]
     if json:
         _print_json(
