@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from controller.types import Action, ArmAction, Array, Pose, StiffnessMode, quaternion_from_rotation_vector
+from controller.types import Action, Array, Pose, StiffnessMode, quaternion_from_rotation_vector
 from studio import models
 from studio.motion import Motion, together
 from studio.parts import GRIP, add_handle, add_part
+from studio.peg_in_hole import MISJUDGED, MISJUDGED_TURN, PegInHole, Pushing, misjudgement
 from studio.session import CONTROL_PERIOD
 from studio.tasks import ArmSetup, CameraView, Grasp, Progress, World
 
@@ -39,7 +40,6 @@ MEETING_TURN = np.radians([5.0, 5.0, 8.0])  # of its orientation, about the worl
 # Success
 HOLE_DEPTH = 0.030  # [m]
 SEATED = 0.022  # [m] depth of the peg's tip below the mouth
-CENTERED = 0.002  # [m] between the peg's tip and the hole's axis
 HELD = 0.5  # [s] during which the peg is seated and both parts are held
 HOLDS = 0.5  # [N] each finger of a hand that holds its part presses at least so hard
 
@@ -69,16 +69,8 @@ LEFT_JOINTS = np.array([-0.73, -1.41, 1.89, -0.48, 2.42, -1.57])
 RIGHT_JOINTS = np.array([-2.41, -1.73, -1.89, -2.66, -2.42, -3.14])
 START_GAP = 0.12  # [m] between the parts
 
-# The demonstrator
-MISJUDGED = 0.0008  # [m] by which the approach misses what the hands alone would tell, on both axes
-MISJUDGED_TURN = math.radians(0.5)
-READING_ERROR = 0.0003  # [m] left after feeling the rim
-READING_TURN = math.radians(0.3)
-PROBE = 0.009  # [m] of the target beyond the mouth when feeling for the hole
-ENTERED = 0.004  # [m] of depth that the peg reaches only inside the hole
-RETREAT = 0.006  # [m] from the mouth between two tries: pushing sideways at the rim would stick
-PUSHED = 0.031  # [m] of the target beyond the mouth at the end
-ATTEMPTS = 5
+PUSHED = 0.031  # [m] depth of the target at the end
+FIT = PegInHole("hole", HOLE_FROM_PEG, "right", SEATED, PUSHED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,18 +218,16 @@ class Insertion:
         self._seated = 0.0
 
     def update(self, world: World) -> None:
-        place = hole_from_peg(world).position
-        seated = -place[2] >= SEATED and math.hypot(place[0], place[1]) <= CENTERED
-        self._seated = self._seated + CONTROL_PERIOD if seated and self._held(world) else 0.0
+        held = FIT.inside(world) >= SEATED and self._held(world)
+        self._seated = self._seated + CONTROL_PERIOD if held else 0.0
 
     def progress(self, world: World) -> Progress:
-        x, y, z = hole_from_peg(world).position.tolist()
-        inside = math.hypot(x, y) <= CENTERED and z < 0.0
-        value = min(1.0, -z / SEATED) if inside else 0.0
+        x, y, z = FIT.place(world).position.tolist()
+        value = min(1.0, FIT.inside(world) / SEATED)
         success = self._seated >= HELD - CONTROL_PERIOD / 2
         if success:
             phase = "inserted"
-        elif inside:
+        elif value > 0.0:
             phase = "hold it" if value == 1.0 else "inserting"
         else:
             phase = "at the rim" if z < 0.003 and math.hypot(x, y) < OUTER else "approach"
@@ -261,52 +251,21 @@ class Insertion:
         style = STYLES[rng.integers(len(STYLES))]
         speed = rng.uniform(0.85, 1.2)
         left, right = (
-            Motion(world.tcp(arm.name), StiffnessMode.MEDIUM, 0.0, speed=speed, base=arm.base_position)
+            Motion(world.tcp(arm.name), StiffnessMode.MEDIUM, 0.0, world.table, speed, arm.base_position)
             for arm in self.arms
         )
-        aim = _misjudged(self._meeting @ HOLE_FROM_PEG, rng, MISJUDGED, MISJUDGED_TURN, self.turn)
-        before = _along(aim, -style.gap * rng.uniform(0.85, 1.15))
+        mouth = self._meeting @ misjudgement(rng, MISJUDGED, MISJUDGED_TURN, self.turn)
+        before = FIT.target(mouth, Pose.identity(), -style.gap * rng.uniform(0.85, 1.15))
         detour = Pose(before.position + style.detour * rng.uniform(0.7, 1.3), before.wxyz)
         seconds = style.approach * rng.uniform(0.9, 1.1)
-
-        def pause() -> Iterator[ArmAction]:
-            return right.wait(style.pause * rng.uniform(0.8, 1.2))
-
-        def push(depth: float) -> Iterator[ArmAction]:
-            goal = _along(aim, depth)
-            distance = float(np.linalg.norm(goal.position - right.pose.position))
-            return right.move(goal, distance / style.push, linear=True)
-
         hands = (left, right)
         yield from together(hands, left.move(self._meeting, seconds), right.move(detour, seconds))
         yield from together(hands, right.move(before, rng.uniform(1.0, 1.4)))
-        yield from together(hands, pause())
+        yield from together(hands, right.wait(style.pause * rng.uniform(0.8, 1.2)))
         left.mode, right.mode = StiffnessMode.HIGH, StiffnessMode.LOW
-        for _ in range(ATTEMPTS):
-            yield from together(hands, push(PROBE))
-            yield from together(hands, right.wait(0.5))
-            if _depth(world) > ENTERED:
-                break
-            yield from together(hands, right.move(_along(aim, -RETREAT), 0.7))
-            yield from together(hands, pause())
-            aim = _misjudged(aligned(world), rng, READING_ERROR, READING_TURN)
-            yield from together(hands, right.move(_along(aim, -RETREAT), rng.uniform(0.6, 0.9)))
-            yield from together(hands, pause())
-        for _ in range(ATTEMPTS):
-            yield from together(hands, push(PUSHED))
-            yield from together(hands, right.wait(0.6))
-            if _depth(world) > SEATED + 0.001:
-                break
-            yield from together(hands, self._wiggle(right))
-            aim = _misjudged(aligned(world), rng, READING_ERROR, READING_TURN)
+        how = Pushing(style.push, style.pause, self.wiggle)
+        yield from together(hands, FIT.feel_in(world, right, mouth, Pose.identity(), how, rng))
         yield from together(hands, right.wait(1.0))
-
-    def _wiggle(self, hand: Motion) -> Iterator[ArmAction]:
-        """Turn the peg about its axis to one side, to the other and back."""
-        middle = hand.pose
-        for angle in (self.wiggle, -self.wiggle, 0.0):
-            turn = Pose(np.zeros(3), quaternion_from_rotation_vector(np.array([0.0, 0.0, angle])))
-            yield from hand.move(middle @ turn, 0.4)
 
     def _held(self, world: World) -> bool:
         """Whether all four fingers press on their parts."""
@@ -322,33 +281,7 @@ class Insertion:
         return bool((pressed >= HOLDS).all())
 
 
-def hole_from_peg(world: World) -> Pose:
-    return world.pose("hole").inverse() @ world.pose("peg")
-
-
-def _depth(world: World) -> float:
-    return -float(hole_from_peg(world).position[2])
-
-
-def aligned(world: World) -> Pose:
-    """world_from_tcp of the right hand with the peg's tip in the middle of the mouth, the axes in line."""
-    peg_from_tcp = world.pose("peg").inverse() @ world.tcp("right")
-    return world.pose("hole") @ HOLE_FROM_PEG @ peg_from_tcp
-
-
-def _along(aim: Pose, distance: float) -> Pose:
-    """`distance` [m] further along the tool."""
-    return aim @ Pose(np.array([0.0, 0.0, distance]), np.array([1.0, 0.0, 0.0, 0.0]))
-
-
 def _moved(pose: Pose, shift: Array, turn: Array) -> Pose:
     """Shifted (3,) [m] and turned by a rotation vector (3,) [rad], both in world axes."""
     turned = Pose(np.zeros(3), quaternion_from_rotation_vector(turn)) @ Pose(np.zeros(3), pose.wxyz)
     return Pose(pose.position + shift, turned.wxyz)
-
-
-def _misjudged(aim: Pose, rng: np.random.Generator, shift: float, tilt: float, turn: float = 0.0) -> Pose:
-    """Off by up to `shift` [m] across the tool, `tilt` [rad] about each axis across it, `turn` about it."""
-    across = np.append(rng.uniform(-shift, shift, 2), 0.0)
-    rotation = np.append(rng.uniform(-tilt, tilt, 2), rng.uniform(-turn, turn))
-    return aim @ Pose(across, quaternion_from_rotation_vector(rotation))

@@ -10,7 +10,7 @@ import pytest
 from controller.types import ARM_ROW, Action, ArmAction, Pose, StiffnessMode
 from studio import tasks
 from studio.inputs.scripted import ScriptedAgent
-from studio.insertion import GRASP_OFFSET, SEATED, aligned, hole_from_peg
+from studio.insertion import FIT, GRASP_OFFSET, SEATED
 from studio.motion import Motion, together
 from studio.twin import Twin
 
@@ -82,7 +82,7 @@ def test_a_peg_that_is_let_go_in_the_hole_does_not_count(twin: Twin) -> None:
     left, right = actions[-1].arms
     for _ in range(30):
         twin.apply(Action((left, ArmAction(right.target, 1.0))))
-    assert -hole_from_peg(twin.world).position[2] > SEATED  # the hole carries it
+    assert FIT.depth(twin.world) > SEATED  # the hole carries it
     assert not twin.progress().success
 
 
@@ -92,12 +92,12 @@ def test_a_peg_beside_the_hole_does_not_count(twin: Twin) -> None:
         Motion(twin.world.tcp(arm.name), StiffnessMode.MEDIUM, gripper=0.0, base=arm.base_position)
         for arm in twin.task.arms
     ]
-    at_mouth = aligned(twin.world)
-    for along in (-0.02, SEATED + 0.004):
-        beside = at_mouth @ Pose(np.array([0.0, 0.075, along]), np.array([1.0, 0.0, 0.0, 0.0]))
+    at_mouth = FIT.target(twin.world.pose("hole"), FIT.peg_from_tcp(twin.world), 0.0)
+    for distance in (-0.02, SEATED + 0.004):
+        beside = at_mouth @ Pose(np.array([0.0, 0.075, distance]), np.array([1.0, 0.0, 0.0, 0.0]))
         _play(twin, together(hands, hands[1].move(beside, 1.5)))
         _play(twin, together(hands, hands[1].wait(1.2)))
-    assert -hole_from_peg(twin.world).position[2] > SEATED
+    assert FIT.depth(twin.world) > SEATED
     assert not twin.progress().success
 
 
