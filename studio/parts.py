@@ -34,6 +34,7 @@ HANDLE_DEPTH = 0.028  # [m] across
 HANDLE_LENGTH = 0.036  # [m] along z
 GRIP = 0.1542  # [m] from the flange to the middle of the pads when they hold a handle
 
+BLOCK_SET_BACK = 0.0002  # [m]
 RING_BOXES = 24  # tangent to the circle of a round hole
 SHELL_CAPSULES = 16  # of a peg: on a circle, or along the sides of a square
 CROWN = 0.002  # [m] by which a peg's middle stands out, so that it touches a rim on the side that is off
@@ -116,6 +117,38 @@ def add_round_hole(body: mujoco.MjsBody, radius: float, depth: float, outer: flo
     for angle in np.arange(RING_BOXES) * 2 * np.pi / RING_BOXES:
         _add_wall(body, radius + half, angle, (half, width, depth / 2), rgba)
     _add_floor(body, outer, depth, rgba)
+
+
+def add_block_around(
+    body: mujoco.MjsBody, half: Array, outer: float, depth: float, rgba: Rgba, friction: float
+) -> None:
+    """A block around a ring of radius `outer` and `depth` [m], its front at z = 0.
+
+    `half` (3,) [m] are its half sides. Its front stands back a little from the ring's: a peg at the mouth
+    touches the ring alone. `friction` is the block's with whatever it stands on.
+    """
+    x, y, _ = half
+    inner = outer / np.sqrt(2.0)  # [m] half side of the square in the ring
+    front, back = -BLOCK_SET_BACK, -2.0 * half[2]
+    for low, high in (
+        ((inner, -y, -depth), (x, y, front)),
+        ((-x, -y, -depth), (-inner, y, front)),
+        ((-inner, inner, -depth), (inner, y, front)),
+        ((-inner, -y, -depth), (inner, -inner, front)),
+        ((-x, -y, back), (x, y, -depth)),
+    ):
+        corners = np.array([low, high])
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(corners[1] - corners[0]) / 2,
+            pos=corners.mean(axis=0),
+            rgba=rgba,
+            friction=(friction, *SURFACE_FRICTION[1:]),
+            solref=SURFACE_SOLREF,
+            solimp=SURFACE_SOLIMP,
+            priority=1,
+            mass=0,
+        )
 
 
 def add_square_hole(body: mujoco.MjsBody, half: float, depth: float, outer: float, rgba: Rgba) -> None:

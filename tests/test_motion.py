@@ -62,6 +62,14 @@ def test_a_quicker_hand_takes_less_time_for_everything() -> None:
     assert len(list(hand(speed=2.0).wait(1.0))) == 50
 
 
+def test_a_hand_opens_evenly_where_it_is() -> None:
+    motion = hand()
+    actions = list(motion.grip(1.0, 0.5))
+    np.testing.assert_allclose([action.gripper for action in actions], 0.25 + 0.75 * np.arange(1, 51) / 50)
+    np.testing.assert_array_equal(positions(actions), np.tile(START.position, (50, 1)))
+    assert motion.gripper == 1.0
+
+
 def test_mode_and_gripper_hold_from_the_next_action_on() -> None:
     motion = hand()
     (first,) = motion.wait(CONTROL_PERIOD)
