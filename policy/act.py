@@ -47,9 +47,10 @@ class Batch:
 
     state: Tensor  # (B, state width)
     wrench: Tensor  # (B, samples, arms * 6), the oldest sample first; not read without wrench
-    images: Tensor  # (B, cameras, h, w, 3) uint8, or float from 0 to 1
+    images: Tensor  # (B, cameras, h, w, 3) uint8
     action: Tensor | None = None  # (B, chunk, action width): what to learn
     valid: Tensor | None = None  # (B, chunk) bool: steps that count
+    light: Tensor | None = None  # (B, cameras, 2): contrast, and what is added, to change images of 0 .. 1 by
 
     def to(self, device: torch.device) -> Batch:
         def moved(tensor: Tensor | None) -> Tensor | None:
@@ -58,7 +59,7 @@ class Batch:
         state, wrench, images = (
             t.to(device, non_blocking=True) for t in (self.state, self.wrench, self.images)
         )
-        return Batch(state, wrench, images, moved(self.action), moved(self.valid))
+        return Batch(state, wrench, images, moved(self.action), moved(self.valid), moved(self.light))
 
 
 class Act(nn.Module):
@@ -152,7 +153,7 @@ class Act(nn.Module):
         x = torch.cat(tokens, dim=1)
         positions = self.token_position[None].expand(len(x), -1, -1)
         if self.n_cameras:
-            seen, seen_positions = self._see(batch.images, hide_images)
+            seen, seen_positions = self._see(batch, hide_images)
             x = torch.cat((x, seen), dim=1)
             positions = torch.cat((positions, seen_positions.expand(len(x), -1, -1)), dim=1)
         for layer in self.encoder:
@@ -165,13 +166,16 @@ class Act(nn.Module):
         actions: Tensor = self.head(self.decoder_norm(y))
         return actions
 
-    def _see(self, images: Tensor, hide: bool) -> tuple[Tensor, Tensor]:
+    def _see(self, batch: Batch, hide: bool) -> tuple[Tensor, Tensor]:
         """(B, cameras * h' * w', d) tokens and (1, …, d) their positions."""
-        pixels = images / 255.0 if images.dtype == torch.uint8 else images
+        pixels = batch.images / 255.0
+        if batch.light is not None:
+            contrast, brightness = batch.light[:, :, None, None, None].unbind(-1)
+            pixels = (pixels - 0.5) * contrast + (0.5 + brightness)
         pixels = (pixels - self.image_mean) / self.image_std * (not hide)
         maps = self.image_token(self.vision(pixels.flatten(0, 1).permute(0, 3, 1, 2)))  # (B c, d, h', w')
         grid = _sine_grid(maps.shape[2], maps.shape[3], maps.shape[1]).to(maps)  # (h' w', d)
-        tokens = maps.flatten(2).transpose(1, 2).reshape(len(images), -1, maps.shape[1])
+        tokens = maps.flatten(2).transpose(1, 2).reshape(len(pixels), -1, maps.shape[1])
         return tokens, (self.camera + grid[None]).reshape(1, -1, maps.shape[1])
 
 
