@@ -16,11 +16,12 @@ from controller.stiffness import StiffnessTable
 from studio import replay as replays
 from studio import tasks
 from studio.catalog import Catalog, Refreshed
-from studio.episode import Episode, Recovery, open_episode, recover_all
+from studio.episode import Episode, open_episode
 from studio.evaluate import Plan, evaluate
 from studio.evaluation import Evaluation, Rollout, find
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
+from studio.recovery import Recovery, recover_all
 from studio.session import Agent
 from studio.station import Station, Take
 from studio.twin import Twin

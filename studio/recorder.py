@@ -27,7 +27,8 @@ from pathlib import Path
 from types import TracebackType
 
 from controller.types import Step
-from studio.episode import PART, EpisodeWriter, Event, Header, Outcome
+from studio.episode import PART, Event, Header, Outcome
+from studio.episode_writer import EpisodeWriter
 
 SYNC_PERIOD = 0.25  # [s] between writes to the disk: half of what a crash may cost
 GATHER = 0.05  # [s] between looks at the queue: waking up for every step would cost half as much again

@@ -30,7 +30,8 @@ from controller.types import (
 )
 from studio.catalog import FACETS, SORTS, Catalog, EpisodeRow, Filters, Summary, summarise
 from studio.edits import FLAGS, OUTCOMES, Edit, Segment, append, edits_path, read
-from studio.episode import EpisodeWriter, Header, Outcome
+from studio.episode import Header, Outcome
+from studio.episode_writer import EpisodeWriter
 
 OUTCOME_OF = {True: "success", False: "failure", None: "unmarked"}
 

@@ -30,7 +30,8 @@ from studio.api import DemoReport
 from studio.benchmarks.episodes import made_up_header, made_up_steps
 from studio.board import Board
 from studio.cursor import CONTACT, FREE, PARTS, STEP, TOUCHES, Cursor, peaks, steps
-from studio.episode import Episode, EpisodeWriter, Event, Outcome, open_episode
+from studio.episode import Episode, Event, Outcome, open_episode
+from studio.episode_writer import EpisodeWriter
 from studio.station import Station
 from studio.twin import Twin, build_model
 

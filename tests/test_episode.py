@@ -38,17 +38,9 @@ from controller.types import (
 from studio import episode as episodes
 from studio import schema
 from studio.benchmarks.episodes import made_up_header, made_up_steps
-from studio.episode import (
-    Episode,
-    EpisodeError,
-    EpisodeWriter,
-    Event,
-    Header,
-    Outcome,
-    open_episode,
-    recover,
-    recover_all,
-)
+from studio.episode import Episode, EpisodeError, Event, Header, Outcome, open_episode
+from studio.episode_writer import EpisodeWriter
+from studio.recovery import recover, recover_all
 
 DONE = Outcome(True, "done", 0.9)
 

@@ -18,7 +18,8 @@ from studio.api import DemoReport
 from studio.benchmarks.episodes import made_up_header, made_up_steps
 from studio.catalog import Catalog
 from studio.cursor import Mark, Span
-from studio.episode import EpisodeWriter, Outcome
+from studio.episode import Outcome
+from studio.episode_writer import EpisodeWriter
 from studio.index import EpisodeRow
 from studio.server import start_viser
 from studio.ui import timeline

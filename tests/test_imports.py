@@ -21,7 +21,7 @@ FORBIDDEN = {
 # Heavy modules and borders to formats and devices, and the only places that may import them.
 ONLY_IN = {
     "torch": ("policy/",),
-    "mcap": ("studio/episode.py", "studio/mcap_file.py"),
+    "mcap": ("studio/mcap_file.py", "studio/recovery.py"),
     "viser": ("studio/ui/", "studio/server.py"),
     "rerun": ("studio/export/rrd.py",),
     "openvr": ("studio/inputs/steamvr.py",),
@@ -34,7 +34,7 @@ ONLY_IN = {
 # Inside studio, lowest first: a file imports nothing of a layer above its own.
 LAYERS = (
     ("channels", "schema", "edits", "index", "doctor"),
-    ("episode", "tasks", "session"),
+    ("episode", "episode_writer", "recovery", "tasks", "session"),
     ("twin", "cameras", "inputs"),
     ("recorder", "catalog", "replay", "evaluate", "jobs", "export"),
     ("api",),

@@ -19,8 +19,9 @@ from controller.types import Step
 from studio import recorder as recorders
 from studio.benchmarks import episodes as bench
 from studio.benchmarks.episodes import made_up_header, made_up_steps
-from studio.episode import Header, Outcome, open_episode, recover_all
+from studio.episode import Header, Outcome, open_episode
 from studio.recorder import NotEnoughSpaceError, Recorder, new_episode_id, versions
+from studio.recovery import recover_all
 
 ROOT = Path(__file__).parent.parent
 DONE = Outcome(True, "done")

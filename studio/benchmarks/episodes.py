@@ -26,7 +26,8 @@ from controller.types import (
     Step,
     Stiffness,
 )
-from studio.episode import Episode, EpisodeWriter, Header, Outcome, open_episode
+from studio.episode import Episode, Header, Outcome, open_episode
+from studio.episode_writer import EpisodeWriter
 from studio.recorder import SYNC_PERIOD, Recorder, new_episode_id
 from studio.session import CONTROL_PERIOD, IMAGE_EVERY, SNAPSHOT_EVERY
 

@@ -19,7 +19,8 @@ from studio.benchmarks import two_arms
 from studio.benchmarks.episodes import made_up_header, made_up_steps
 from studio.benchmarks.scene import Viewer
 from studio.catalog import Catalog
-from studio.episode import EpisodeWriter, Outcome
+from studio.episode import Outcome
+from studio.episode_writer import EpisodeWriter
 from studio.twin import Twin
 
 if TYPE_CHECKING:
