@@ -477,6 +477,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "doctor": doctor,
     "demo": demo,
     "evaluate": evaluate,
+    "probe": probe,
     "policy-server": policy_server,
     "episodes": episodes,
     "show": show,
