@@ -200,6 +200,29 @@ def evaluate(
     return int(any(rollout.error is not None for rollout in found.rollouts))
 
 
+def probe(task: Positional[TaskName], episodes: int = 200, seed: int = 0, json: Json = False) -> int:
+    """Show what images and forces tell of how a part lies in the hand, over many scenes.
+
+    Args:
+        episodes: How many scenes.
+        seed: Of the first.
+    """
+    from studio import probes
+
+    with _progress(f"probe of {task}", episodes, quiet=json) as advance:
+        found = probes.probe(task, range(seed, seed + episodes), on_seed=advance)
+    if json:
+        _print_json(found)
+        return 0
+    table = _table("part", ">offset mm", ">R² forces", ">R² images", "R² of each camera")
+    for told in found:
+        each = ", ".join(f"{camera} {r2:.2f}" for camera, r2 in told.from_each_camera.items())
+        forces, images = f"{told.from_forces:.2f}", f"{told.from_images:.2f}"
+        table.add_row(told.part, f"{told.spread_mm:.1f}", forces, images, each)
+    console.print(table)
+    return 0
+
+
 def policy_server(
     agent: Positional[Annotated[str, arg(metavar="RUN")]],
     host: str = "127.0.0.1",
