@@ -38,7 +38,7 @@ LAYERS = (
     ("twin", "cameras", "inputs"),
     ("recorder", "catalog", "replay", "evaluate", "jobs", "export"),
     ("api",),
-    ("server", "ui", "serve", "__main__"),
+    ("server", "headset", "ui", "serve", "__main__"),
 )
 SKINS = len(LAYERS) - 1
 
