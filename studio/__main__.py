@@ -445,20 +445,34 @@ def serve(
     task: str = "wiping",
     cameras: bool = True,
     stiffness_table: Literal["tuned", "literal"] = "tuned",
+    cert: Path | None = None,
+    key: Path | None = None,
+    tls: bool = True,
+    new_token: bool = False,
     open: bool = False,
 ) -> int:
     """Serve the page: drive, record and review in the browser, until Ctrl-C.
 
     Args:
-        host: Where to listen; only this machine by default.
+        host: Where to listen; only this machine by default. Elsewhere a token is needed, and TLS is spoken.
         port: 0 takes a free one.
         task: What is on the stage first.
         cameras: Render images.
         stiffness_table: What low, medium and high mean: our values, or the paper's numbers on all diagonals.
+        cert: A certificate that browsers trust, instead of this installation's own; see `studio cert`.
+        key: Its key.
+        tls: Encrypt what goes to other machines; only a proxy that does so itself makes this needless.
+        new_token: Shut out everybody who came in by the link so far.
         open: Open the page in this machine's browser.
     """
     from studio import serve as server
+    from studio.cert import Certificate, read
 
+    if (cert is None) != (key is None):
+        raise ValueError("--cert and --key belong together; give both or none.")
+    certificate = Certificate(cert, key) if cert and key else None
+    if certificate:
+        read(certificate)  # refuses what is none
     server.serve(
         data,
         host,
@@ -466,9 +480,33 @@ def serve(
         task,
         cameras=cameras,
         stiffness_table=stiffness_table,
+        certificate=certificate,
+        tls=tls,
+        new_token=new_token,
         open_page=open,
         tell=_say,
     )
+    return 0
+
+
+def make_certificate(names: tuple[str, ...] = (), json: Json = False) -> int:
+    """Make a new certificate of this installation, for the pages that other machines open.
+
+    Args:
+        names: Further host names and addresses of this machine, e.g. of a DNS server.
+    """
+    from studio import cert, invitation
+
+    certificate = cert.make(invitation.folder(), (*names, *cert.names_of_this_machine()))
+    facts = cert.read(certificate)
+    if json:
+        _print_json({**dataclasses.asdict(facts), "cert": certificate.path, "key": certificate.key})
+        return 0
+    console.print(f"{certificate.path}, with a key that only you can read, until {facts.expires:%d %b %Y}.")
+    console.print(
+        f"For {', '.join(facts.names)}. Browsers warn once; its SHA-256 fingerprint is", soft_wrap=True
+    )
+    console.print(f"  {facts.fingerprint}", soft_wrap=True)
     return 0
 
 
@@ -496,6 +534,7 @@ def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "serve": serve,
+    "cert": make_certificate,
     "tasks": show_tasks,
     "doctor": doctor,
     "demo": demo,

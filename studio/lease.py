@@ -45,6 +45,7 @@ class Standing:
     is_mine: bool
     asker: str  # who wants to; empty while nobody does
     is_asked_by_me: bool
+    n_people: int  # who are connected
 
 
 class Lease:
@@ -54,15 +55,11 @@ class Lease:
         self,
         post: Callable[[Command], None],
         tell: Callable[[Notice], None] = lambda _: None,
-        on_change: Callable[[], None] = lambda: None,
         now: Callable[[], float] = time.monotonic,
         call_later: Timer | None = None,
     ) -> None:
-        """`post` takes commands to the session, `tell` tells everybody, `on_change` hears of a change.
-
-        All three are called with the lease locked and must not wait.
-        """
-        self._post, self._tell, self._on_change = post, tell, on_change
+        """`post` takes commands to the session, `tell` tells everybody. Both must not wait."""
+        self._post, self._tell = post, tell
         self._now, self._call_later = now, call_later or _call_later
         self._lock = threading.RLock()
         self._seats: list[Seat] = []
@@ -81,7 +78,7 @@ class Lease:
 
     @property
     def holder(self) -> str:
-        """Who may drive, in words; empty while nobody does."""
+        """Who may drive, in words: a name or "guest 2"; empty while nobody does."""
         with self._lock:
             return self._words(self._holder)
 
@@ -136,7 +133,6 @@ class Lease:
                 return
             if seat.person == self._asker:
                 self._asker = None
-                self._on_change()
             if seat.person == self._holder:
                 self._left = self._now()
                 self._call_later(GRACE, self.settle)
@@ -150,7 +146,6 @@ class Lease:
                     raise NotDriving(f"{self._words(self._asker)} has asked already.")
                 self._asker, self._acted = seat.person, self._now()
                 self._call_later(PATIENCE, self.settle)
-                self._on_change()
 
     def _answer(self, seat: Seat, yes: bool) -> None:
         with self._lock:
@@ -162,25 +157,20 @@ class Lease:
             elif asker:
                 self._asker = None
                 self._tell(Notice(kind="info", text=f"{self._words(seat.person)} keeps control."))
-                self._on_change()
 
     def _rename(self, seat: Seat, name: str) -> None:
         with self._lock:
             self._names[seat.person] = _clean(name)
-            self._on_change()
 
     def _standing(self, seat: Seat) -> Standing:
         with self._lock:
             return Standing(
                 holder=self._words(self._holder),
-                is_mine=seat.person == self._holder,
+                is_mine=seat.person == self._holder and seat in self._seats,
                 asker=self._words(self._asker),
                 is_asked_by_me=seat.person == self._asker,
+                n_people=len({seat.person for seat in self._seats}),
             )
-
-    def _name(self, seat: Seat) -> str:
-        with self._lock:
-            return self._names.get(seat.person, "")
 
     # With the lock held
 
@@ -194,7 +184,6 @@ class Lease:
             self._post(OperatorLeft())
             now = f" {self._words(person)} has control." if person else ""
             self._tell(Notice(kind="info", text=why + now))
-        self._on_change()
 
 
 class Seat:
@@ -216,7 +205,14 @@ class Seat:
     @property
     def name(self) -> str:
         """As the person typed it, or empty."""
-        return self._lease._name(self)
+        with self._lease._lock:
+            return self._lease._names.get(self.person, "")
+
+    @property
+    def words(self) -> str:
+        """The name, or something like "guest 2"."""
+        with self._lease._lock:
+            return self._lease._words(self.person)
 
     def admit(self, *, takes: bool = True) -> None:
         """Raise `NotDriving` unless this person may command; a free lease is taken if `takes`."""

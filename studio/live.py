@@ -379,7 +379,7 @@ class LiveSession:
                     level=level,
                     why=why,
                     input_age=hand.input_age,
-                    opening=hand.gripper,
+                    opening=robot.arms[index].servo.gripper,
                     hand=hand.status,
                 )
             )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import getpass
 import json
 import logging
 import os
@@ -26,13 +27,15 @@ from typing import IO, TYPE_CHECKING, Any
 import rich
 
 from controller.stiffness import StiffnessTable
-from studio import tasks
+from studio import cert, invitation, tasks
 from studio.api import Studio
+from studio.cert import Certificate
 from studio.link import socket_path
 from studio.messages import Shutdown
 from studio.proxy import LOOPBACK
-from studio.server import PORT, FrontServer, make_app, start_viser
+from studio.server import PORT, FrontServer, is_loopback, make_app, start_viser
 from studio.ui.app import Page
+from studio.ui.gate import Gate
 from studio.ui.remote import Remote
 
 if TYPE_CHECKING:
@@ -136,12 +139,17 @@ def serve(
     *,
     cameras: bool = True,
     stiffness_table: StiffnessTable = "tuned",
+    certificate: Certificate | None = None,
+    tls: bool = True,
+    new_token: bool = False,
     open_page: bool = False,
     tell: Callable[[str], None] = print,
 ) -> None:
     """Serve the page of a data folder until SIGINT or SIGTERM.
 
-    Raises OSError or RuntimeError with a sentence where it cannot, e.g. where another server does already.
+    Any other address than loopback gets a token, a new one if asked for, and TLS with the `certificate` or
+    with this installation's own, unless switched off. Raises OSError or RuntimeError with a sentence where it
+    cannot, e.g. where another server does already.
     """
     tasks.load(task)  # an unknown task is refused before anything starts
     data_dir = data_dir.absolute()
@@ -154,14 +162,22 @@ def serve(
         for recovery in studio.recover():
             tell(recovery.what)
         process = SessionProcess(data_dir, task, cameras=cameras, stiffness_table=stiffness_table)
-        viewer = start_viser()
+        is_local = is_loopback(host)
+        if not is_local and certificate is None and tls:
+            certificate = cert.of_installation(invitation.folder())
+        token = None if is_local else invitation.token(renew=new_token)
+        gate = Gate(_user() if is_local else "")
+        viewer = start_viser(arrive=gate.arrive)
         stack.callback(_stop, viewer)
-        page = Page(viewer, studio, process)
+        page = Page(viewer, studio, process, gate, (lambda: front.invitation) if token else None)
         stack.callback(page.close)
         app = make_app(
-            viewer.get_port(), health=lambda: health(page.remote, process, len(viewer.get_clients()))
+            viewer.get_port(),
+            health=lambda: health(page.remote, process, len(viewer.get_clients())),
+            reception=gate.receive,
         )
-        front = stack.enter_context(FrontServer(app, host, port))
+        front = FrontServer(app, host, port, token=token, certificate=certificate)
+        stack.enter_context(front)
         _write(lock, front.url)
         page.start()
         if pid := process.find():
@@ -171,10 +187,30 @@ def serve(
         stack.callback(_end_session, page.remote, process)
         process.connect(page.remote)
         tell(f"Comp-ACT Studio serves {data_dir} at {front.url}")
+        if token:
+            tell(_invite(front.invitation, certificate))
         if open_page:
             webbrowser.open(front.url)
         ended.wait()
         tell("Ending. A running take is kept.")
+
+
+def _invite(link: str, certificate: Certificate | None) -> str:
+    """What the terminal tells once: the link, and how to know that it leads here."""
+    lines = [invitation.qr_text(link)] if sys.stdout.isatty() else []
+    lines += [f"Others come in by this link; who has it may ask for control:\n  {link}"]
+    if certificate is None:
+        lines += ["Without TLS whoever shares the network can read it, and headsets show no VR."]
+    else:
+        facts = cert.read(certificate)
+        lines += [f"Their browsers warn once of a certificate with the fingerprint\n  {facts.fingerprint}"]
+    return "\n".join(lines)
+
+
+def _user() -> str:
+    """Who is logged in, unless that says nothing."""
+    user = getpass.getuser()
+    return "" if user == "root" else user
 
 
 def health(remote: Remote, process: SessionProcess, n_viewers: int) -> dict[str, Any]:

@@ -31,7 +31,8 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from studio.cert import Certificate
+from studio import invitation
+from studio.cert import Certificate, names_of_this_machine
 from studio.door import Access, Door, in_url, known_host, refuse, same_origin
 from studio.proxy import GRACE, LOOPBACK, UNSENT_LIMIT, VISIT, Reception, ViserProxy
 
@@ -166,6 +167,12 @@ class FrontServer:
     def url(self) -> str:
         """As a browser on this machine opens it."""
         return self.url_at("localhost" if self._host in ("0.0.0.0", "::") else self._host)
+
+    @property
+    def invitation(self) -> str:
+        """The link by which a browser elsewhere comes in. Holds the token: show it, never log it."""
+        name = names_of_this_machine()[0] if self._host in ("0.0.0.0", "::") else self._host
+        return invitation.link(self.url_at(name), self.token) if self.token else self.url_at(name)
 
     def url_at(self, name: str) -> str:
         """As a browser opens it that knows this machine by that name or address."""

@@ -55,7 +55,7 @@ class Rig:
         self.catalog = Catalog(data)
         self.live = SceneView(self.server, model("wiping"), LIVE)
         tab = self.server.gui.add_tab_group().add_tab("Episodes")
-        self.tab = EpisodesTab(self.server, tab, self.catalog, model=model, author=lambda: "Ana")
+        self.tab = EpisodesTab(self.server, tab, self.catalog, model=model, author=lambda _: "Ana")
 
     def close(self) -> None:
         self.tab.close()

@@ -16,6 +16,7 @@ from studio.api import Studio
 from studio.serve import LOCK, SessionProcess
 from studio.server import start_viser
 from studio.ui.app import Page
+from studio.ui.gate import Gate
 from studio.ui.remote import Remote
 
 
@@ -79,10 +80,11 @@ def test_a_take_goes_on_while_the_web_process_is_killed_and_comes_back(site: Sit
 
 def test_a_session_killed_while_recording_is_restarted_and_its_take_recovered(site: Site) -> None:
     data = site.data
-    viewer = start_viser()
+    gate = Gate()
+    viewer = start_viser(arrive=gate.arrive)
     process = SessionProcess(data, "wiping", cameras=False)
     with Studio(data) as studio:
-        page = Page(viewer, studio, process)
+        page = Page(viewer, studio, process, gate)
         process.start()
         process.connect(page.remote)
         page.start()

@@ -37,17 +37,21 @@ def measure() -> dict[str, float]:
     from studio.serve import SWITCH_INTERVAL, SessionProcess
     from studio.server import FrontServer, make_app, start_viser
     from studio.ui.app import Page
+    from studio.ui.gate import Gate
 
     sys.setswitchinterval(SWITCH_INTERVAL)
-    server = start_viser()
+    gate = Gate()
+    server = start_viser(arrive=gate.arrive)
     with tempfile.TemporaryDirectory() as folder, Studio(folder) as studio:
         process = SessionProcess(Path(folder), "wiping")
-        page = Page(server, studio, process)
+        page = Page(server, studio, process, gate)
+        app = make_app(server.get_port(), reception=gate.receive)
         try:
             process.start()
             process.connect(page.remote)
             page.start()
-            with FrontServer(make_app(server.get_port()), port=0) as front, Hand(server, front.port) as hand:
+            with FrontServer(app, port=0) as front, Hand(server, front.port) as hand:
+                gate.seats[0].ask()
                 return _drag(page, hand)
         finally:
             page.close()

@@ -11,6 +11,7 @@ import json
 import logging
 import threading
 import time
+from collections.abc import Callable
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -23,9 +24,11 @@ from controller.types import Pose, Wrench
 from studio.api import Studio
 from studio.messages import CameraImage, Frame, Notice, Status
 from studio.ui import scene, viser_private
+from studio.ui.control import ControlRows
 from studio.ui.desk import Desk
 from studio.ui.episodes import EpisodesTab
 from studio.ui.first_steps import FirstSteps
+from studio.ui.gate import Gate
 from studio.ui.gizmo import Gizmo
 from studio.ui.keys import Hotkey, Hotkeys, Keypad, table
 from studio.ui.plots import LivePlots
@@ -59,10 +62,20 @@ class SessionProcess(Protocol):
 class Page:
     """One data folder's page on a viser server. `close` leaves the session process alone."""
 
-    def __init__(self, server: viser.ViserServer, studio: Studio, process: SessionProcess) -> None:
-        self.remote = Remote()
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        studio: Studio,
+        process: SessionProcess,
+        gate: Gate,
+        invitation: Callable[[], str] | None = None,
+    ) -> None:
+        """`gate` heard of every connection to `server`; `invitation` tells the link for others."""
+        self.remote, self._gate = gate.remote, gate
+        gate.attach(server)
         self._server, self._studio, self._process = server, studio, process
-        self._desk = Desk(self.remote, studio.delete, studio.restore)
+        self._desk = Desk(self.remote, studio.delete, studio.restore, operator=lambda: gate.lease.holder_name)
+        self._invitation = invitation
         self._model = cache(scene.SceneModel)
         self._stage: Stage | None = None
         self._restarting = threading.Lock()
@@ -124,6 +137,8 @@ class Page:
             )
             self._first_steps = FirstSteps(gui, is_needed=not self._studio.catalog.count())
             with gui.add_folder(None, visible=False) as self._driving:
+                self._control = ControlRows(server, gui.add_folder(None, order=0.0), self._gate)
+                gui.add_html('<i class="of-operator"></i>', order=0.1)
                 self._teleop = TeleopTab(gui, self._desk, keypad)
                 with gui.add_folder("Keys", expand_by_default=False, order=9.0):
                     self._keys = gui.add_html(table(self._hotkeys.keys))
@@ -132,14 +147,23 @@ class Page:
             tabs.add_tab("Episodes"),
             self._studio.catalog,
             model=self._model,
-            author=lambda: self._desk.operator or getpass.getuser(),
+            author=self._author,
+            mark=lambda episode_id, is_deleted: self._desk.mark(episode_id, is_deleted=is_deleted),
         )
         with tabs.add_tab("System"):
-            self._system = SystemTab(gui, self._desk, self._studio.data_dir, self.restart_session)
+            self._system = SystemTab(
+                gui, self._desk, self._studio.data_dir, self.restart_session, self._invitation
+            )
+            for button in self._system.for_everybody:
+                self._gate.free(button)
 
         @self._restart.on_click
         def _(_: object) -> None:
             self.restart_session()
+
+    def _author(self, client_id: int) -> str:
+        seat = self._gate.seat(client_id)
+        return seat.words if seat else getpass.getuser()
 
     # Painting
 
@@ -180,7 +204,10 @@ class Page:
 
     def _show_words(self, status: Status | None, state: State) -> None:
         choice = active_choice(status, self._desk.choice) if status else "nobody"
-        self._line.show(status, state, "keyboard" if choice == "keyboard" else "gizmo")
+        self._line.show(
+            status, state, "keyboard" if choice == "keyboard" else "gizmo", self._gate.lease.holder
+        )
+        self._control.show()
         self._system.show(status, state, len(self._server.get_clients()))
         is_lost = state != "open"
         self._lost.content = f'<div class="card bad">{lost(status, state)}</div>'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import time
 from collections.abc import Callable
 from typing import Literal, get_args
@@ -26,7 +25,9 @@ from studio.messages import (
     SetMode,
     StartTake,
     Status,
+    TakeRestored,
     TakeStatus,
+    TakeTrashed,
 )
 from studio.ui.remote import Remote
 
@@ -43,17 +44,19 @@ class Desk:
         remote: Remote,
         delete: Callable[[str], object],
         restore: Callable[[str], object],
+        operator: Callable[[], str] = str,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`delete` moves the take of an id to the trash, `restore` brings it back."""
+        """`delete` moves the take of an id to the trash, `restore` brings it back.
+
+        `operator` tells the name of the person who drives.
+        """
         self._remote, self._delete, self._restore = remote, delete, restore
-        user = getpass.getuser()
-        self.operator = "" if user == "root" else user  # the person's name
+        self._operator = operator
         self.countdown = 3.0  # [s] before recording
         self.with_sounds = True
         self.choice: Choice = "nobody"  # who was asked to drive last
         self.keyboard_arm = 0
-        self.grippers: dict[int, float] = {}  # opening that was asked for, since the reset
         self._started = -SIMULTANEOUS  # [s] monotonic time of the last start
         self._now = now
         self._is_deleted: dict[str, bool] = {}  # of takes, where it differs from what the session knows
@@ -61,6 +64,11 @@ class Desk:
     @property
     def status(self) -> Status | None:
         return self._remote.status.get()[0]
+
+    @property
+    def operator(self) -> str:
+        """Name of the person who drives; empty where they gave none."""
+        return self._operator()
 
     # Scene
 
@@ -104,11 +112,11 @@ class Desk:
             self.set_mode(arm, other if status.arms[arm].mode == one else one)
 
     def set_gripper(self, arm: int, opening: float) -> None:
-        self.grippers[arm] = opening
         self._remote.post(SetGripper(arm=arm, opening=opening))
 
     def toggle_gripper(self, arm: int) -> None:
-        self.set_gripper(arm, 0.0 if self.grippers.get(arm, 0.0) > 0.5 else 1.0)
+        if status := self.status:
+            self.set_gripper(arm, 0.0 if status.arms[arm].opening > 0.5 else 1.0)
 
     def nudge(
         self, translation: tuple[float, float, float], rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -149,7 +157,7 @@ class Desk:
             self._remote.post(DiscardTake())
         elif (take := status.last_take) and not self.is_discarded(take):
             if self._does(self._delete, take.episode_id, "deleted"):
-                self._is_deleted[take.episode_id] = True
+                self.mark(take.episode_id, is_deleted=True)
                 self._notice("take discarded", f"In the trash: {take.episode_id}.")
         else:
             self.tell("No take to discard.")
@@ -160,12 +168,18 @@ class Desk:
         if not take or not self.is_discarded(take):
             self.tell("Nothing to undo: the last take is not in the trash.")
         elif self._does(self._restore, take.episode_id, "restored"):
-            self._is_deleted[take.episode_id] = False
+            self.mark(take.episode_id, is_deleted=False)
             self._notice("take kept", f"Back again: {take.episode_id}.")
 
     def is_discarded(self, take: TakeStatus) -> bool:
         """Whether it lies in the trash now."""
         return self._is_deleted.get(take.episode_id, take.discarded)
+
+    def mark(self, episode_id: str, *, is_deleted: bool) -> None:
+        """A take was moved to the trash, or brought back; the session hears of it."""
+        self._is_deleted[episode_id] = is_deleted
+        kind = TakeTrashed if is_deleted else TakeRestored
+        self._remote.post(kind(episode_id=episode_id))
 
     def collect(self, count: int, seed: int) -> None:
         """Takes of consecutive seeds until `count` are kept."""

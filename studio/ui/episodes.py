@@ -32,10 +32,14 @@ class EpisodesTab:
         catalog: Catalog,
         *,
         model: Callable[[str], SceneModel] | None = None,
-        author: Callable[[], str] = getpass.getuser,
+        author: Callable[[int], str] = lambda _: getpass.getuser(),
+        mark: Callable[[str, bool], None] = lambda _, __: None,
     ) -> None:
-        """`model` gives the scene of a task, best always the same one; `author` is who annotates."""
-        self.catalog, self.author = catalog, author
+        """`model` gives the scene of a task, best always the same one.
+
+        `author` tells who a client is. `mark` hears of takes that are moved to the trash (True) or back.
+        """
+        self.catalog, self.author, self.mark = catalog, author, mark
         self.model = model or cache(SceneModel)
         self.server, self._tab = server, tab
         self._clients: dict[int, ClientEpisodes] = {}
@@ -135,22 +139,21 @@ class ClientEpisodes:
         """Say something about the open take; `changes` are fields of `studio.edits.Edit`."""
         with self._turn():
             if self.review is not None:
-                row = self._catalog.annotate(
-                    self.review.row.episode_id, author=self._everybody.author(), **changes
-                )
+                row = self._catalog.annotate(self.review.row.episode_id, author=self._author, **changes)
                 self._changed(row)
 
     def undo(self) -> None:
         """Take back this author's last change of the open take."""
         with self._turn():
             if self.review is not None:
-                self._changed(self._catalog.undo(self.review.row.episode_id, author=self._everybody.author()))
+                self._changed(self._catalog.undo(self.review.row.episode_id, author=self._author))
 
     def delete(self) -> None:
         """Move the open take to the trash; the list offers to bring it back."""
         with self._turn():
             if self.review is not None:
                 self._deleted = self._catalog.delete(self.review.row.episode_id).episode_id
+                self._everybody.mark(self._deleted, True)
                 self._leave()
                 self._list_folder.visible, self._card_folder.visible = True, False
                 self.takes.offer_undo(self._deleted)
@@ -165,9 +168,14 @@ class ClientEpisodes:
         with self._turn():
             if self._deleted is not None:
                 self._catalog.restore(self._deleted)
+                self._everybody.mark(self._deleted, False)
                 self._deleted = None
                 self.takes.offer_undo(None)
                 self._everybody.show()
+
+    @property
+    def _author(self) -> str:
+        return self._everybody.author(self._client.client_id)
 
     def _changed(self, row: EpisodeRow) -> None:
         self._card.show(row)

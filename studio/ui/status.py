@@ -38,8 +38,11 @@ class StatusLine:
         self._line = gui.add_html(line(None, "closed", "gizmo"))
         self._over = gui.add_html("")
 
-    def show(self, status: Status | None, state: State, operator_input: OperatorInput) -> None:
-        self._line.content = line(status, state, operator_input)
+    def show(
+        self, status: Status | None, state: State, operator_input: OperatorInput, control: str = ""
+    ) -> None:
+        """`control`: who may drive, in words."""
+        self._line.content = line(status, state, operator_input, control)
         self._over.content = over(status, state)
 
 
@@ -78,7 +81,7 @@ _NOTICES: Mapping[NoticeKind, tuple[str, Color, float | None]] = {
 }
 
 
-def line(status: Status | None, state: State, operator_input: OperatorInput) -> str:
+def line(status: Status | None, state: State, operator_input: OperatorInput, control: str = "") -> str:
     """The status line as HTML."""
     parts = ['<span class="name"><b>Comp-ACT Studio</b></span>']
     if status is not None:
@@ -86,7 +89,7 @@ def line(status: Status | None, state: State, operator_input: OperatorInput) -> 
     if status is None or state != "open":
         parts.append(f'<span class="refused"><b>{_lost_word(status, state)}</b></span>')
         return _bar(parts, [])
-    parts.append(f"<span>{driver(status, operator_input)}</span>")
+    parts.append(f"<span>{driver(status, operator_input, control)}</span>")
     parts += [_arm(arm, status) for arm in status.arms]
     return _bar(parts, [_pace(status), _input(status), _recording(status)])
 
@@ -119,16 +122,17 @@ def lost(status: Status | None, state: State) -> str:
     return what + take
 
 
-def driver(status: Status, operator_input: OperatorInput) -> str:
-    """Who drives, in words, as HTML."""
-    name = escape(status.operator)
+def driver(status: Status, operator_input: OperatorInput, control: str = "") -> str:
+    """Who drives, and who has control, as HTML."""
+    name, control = escape(status.operator or control), escape(control)
+    has_control = f", <b>{control}</b> has control" if control else ""
     match status.driver:
         case "nobody":
-            return '<span class="dim">nobody drives, the arms hold</span>'
+            return f'<span class="dim">nobody drives, the arms hold{has_control}</span>'
         case "operator":
             return f"<b>{name or 'operator'}</b> drives by {operator_input}"
         case "script":
-            return "the <b>script</b> drives"
+            return f"the <b>script</b> drives{has_control}"
         case other:
             assert_never(other)
 

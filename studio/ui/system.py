@@ -11,6 +11,7 @@ from pathlib import Path
 import viser
 
 from studio.doctor import Finding, diagnose
+from studio.invitation import qr_svg
 from studio.messages import Status
 from studio.session import CONTROL_PERIOD, LATE
 from studio.ui.desk import Desk
@@ -23,9 +24,14 @@ class SystemTab:
     """Built into the container that is open; `show` keeps it up to date."""
 
     def __init__(
-        self, gui: viser.GuiApi, desk: Desk, data_dir: Path, restart_session: Callable[[], None]
+        self,
+        gui: viser.GuiApi,
+        desk: Desk,
+        data_dir: Path,
+        restart_session: Callable[[], None],
+        invitation: Callable[[], str] | None = None,
     ) -> None:
-        """`restart_session` must not wait."""
+        """`restart_session` must not wait; `invitation` gives the link with the token, where there is one."""
         self._data_dir = data_dir
         self._facts = gui.add_html("")
         self._restart = gui.add_button("Restart session", color="dark", icon=viser.Icon.REFRESH)
@@ -35,6 +41,11 @@ class SystemTab:
             findings = gui.add_html(
                 '<div class="text dim">What is installed here, and the line that installs the rest.</div>'
             )
+
+        self.for_everybody = [check]  # also for who only watches
+        if invitation is not None:
+            with gui.add_folder("Others") as others:
+                self.for_everybody.append(_add_invitation(gui, others, invitation))
 
         @self._restart.on_click
         def _(_: object) -> None:
@@ -60,6 +71,35 @@ class SystemTab:
         self._restart.color = "dark" if state == "open" else "red"
         # Restarting ends the take; whoever wants that stops it first.
         self._restart.disabled = state == "open" and status is not None and status.phase == "recording"
+
+
+def _add_invitation(
+    gui: viser.GuiApi, container: viser.GuiFolderHandle, invitation: Callable[[], str]
+) -> viser.GuiButtonHandle:
+    """A button that shows the link and its QR code to the client that presses it, and hides them again."""
+    button = gui.add_button("Invite somebody", color="dark", icon=viser.Icon.QRCODE)
+    shown: dict[int, viser.GuiHtmlHandle] = {}
+
+    @button.on_click
+    def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        client = event.client
+        if client is None:
+            return
+        if (there := shown.pop(client.client_id, None)) is not None:
+            there.remove()
+        else:
+            with container:
+                shown[client.client_id] = client.gui.add_html(invitation_html(invitation()))
+
+    return button
+
+
+def invitation_html(link: str) -> str:
+    """The link with its QR code."""
+    return (
+        f'<div class="text invitation">{qr_svg(link)}<code>{escape(link)}</code>'
+        "Whoever has this link may come in, watch, and ask for control.</div>"
+    )
 
 
 def facts(status: Status | None, state: State, n_viewers: int, data_dir: Path, free: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from html import escape
@@ -20,6 +21,7 @@ ACTIVE: Final = "blue"
 PASSIVE: Final = "dark"
 LABELS: dict[Choice, str] = {"gizmo": "Gizmo", "keyboard": "Keys", "script": "Script", "nobody": "Nobody"}
 MOST_TAKES = 1000
+SETTLE = 0.5  # [s] until what a person has set comes back from the session
 
 
 class TeleopTab:
@@ -89,7 +91,6 @@ class _SceneRows:
 class _DriverRows:
     def __init__(self, gui: viser.GuiApi, desk: Desk, keypad: Keypad) -> None:
         self._desk, self._keypad = desk, keypad
-        name = gui.add_text("Operator", desk.operator, hint="Your name, kept with each take.")
         _columns(gui, 4)
         self._buttons = {choice: gui.add_button(LABELS[choice], color=PASSIVE) for choice in CHOICES}
         self._hint = gui.add_html("")
@@ -101,10 +102,6 @@ class _DriverRows:
         )
         on_click(self._mirror, desk.toggle_mirror)
         keypad.build(gui)
-
-        @name.on_update
-        def _(_: object) -> None:
-            desk.operator = name.value
 
         for choice, button in self._buttons.items():
             on_click(button, partial(desk.drive, choice))
@@ -131,9 +128,7 @@ class _ArmRows:
     """One arm: stiffness, gripper, parking."""
 
     def __init__(self, gui: viser.GuiApi, desk: Desk, arm: int, setup: ArmSetup, n_arms: int) -> None:
-        self._resets = -1
-        self._desk, self._arm = desk, arm
-        self._rest = 0.0 if setup.grasp else setup.gripper
+        self._touched = 0.0  # [s] monotonic time at which a person last moved the slider
         self._folder = gui.add_folder(f"{setup.name.capitalize()} arm")
         self._shift = "⇧" if is_shifted(arm, n_arms) else ""
         with self._folder:
@@ -143,7 +138,7 @@ class _ArmRows:
                 for mode in sorted(setup.modes, key=lambda mode: ("low", "medium", "high").index(mode.value))
             }
             self._gripper = gui.add_slider(
-                "Gripper", 0.0, 1.0, 0.01, self._rest, hint=f"0 closed, 1 open; {self._shift}G switches."
+                "Gripper", 0.0, 1.0, 0.01, 0.0, hint=f"0 closed, 1 open; {self._shift}G switches."
             )
             is_last = arm == n_arms - 1
             if is_last:
@@ -159,6 +154,7 @@ class _ArmRows:
         @self._gripper.on_update
         def _(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
             if event.client is not None:
+                self._touched = time.monotonic()
                 desk.set_gripper(arm, self._gripper.value)
 
         @self._park.on_click
@@ -168,10 +164,8 @@ class _ArmRows:
     def show(self, arm: ArmStatus, status: Status) -> None:
         for mode, button in self._modes.items():
             _set_active(button, _sentence(mode_words(mode)), mode == arm.mode)
-        if status.resets != self._resets:
-            self._resets = status.resets
-            self._desk.grippers[self._arm] = self._rest
-        set_value(self._gripper, self._desk.grippers[self._arm])
+        if time.monotonic() > self._touched + SETTLE:  # never against a hand that drags
+            set_value(self._gripper, arm.opening)
         self._park.label = f"{'Park' if arm.engaged else 'Engage'} ({self._shift}P)"
         self._park.color = PASSIVE if arm.engaged else ACTIVE
         self._park.disabled = status.driver != "operator"
