@@ -24,6 +24,8 @@ FELT_REACH = 0.0005  # [m] felt fibres reach this far below the felt's plane
 
 _PAPER = np.array([236, 238, 240], np.float32)
 _INK = np.array([24, 38, 84], np.float32)
+_SHARES = (np.arange(256)[:, None] / np.float32(255)).astype(np.float32)
+_COLORS = (_PAPER + (_INK - _PAPER) * _SHARES).astype(np.uint8)  # (256, 3) of each level
 
 
 class Board:
@@ -118,8 +120,7 @@ class Board:
 
     def picture(self) -> Array:
         """(256, 256, 3) uint8 as a texture: columns run along +x, the top row is +y."""
-        share = (self.grid.T[::-1, :, None] / np.float32(255)).astype(np.float32)
-        return (_PAPER + (_INK - _PAPER) * share).astype(np.uint8)
+        return _COLORS.take(self.grid.T[::-1], axis=0)
 
     def state(self) -> dict[str, Array]:
         return {"ink": self.grid.copy(), "ink_carry": np.array([self._carry])}

@@ -56,6 +56,8 @@ def new_spec() -> mujoco.MjSpec:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 640, 480
     spec.visual.quality.offsamples = 0  # multisampling triples the cost of software rendering
     spec.visual.quality.shadowsize = 0
+    # Of cylinders and capsules: the defaults give a peg of capsules more faces than two arms.
+    spec.visual.quality.numslices, spec.visual.quality.numstacks = 16, 4
     spec.visual.map.znear = 0.005  # [extent] the wrist camera sees the fingers
     spec.visual.headlight.ambient = (0.35, 0.35, 0.35)
     spec.visual.headlight.diffuse = (0.45, 0.45, 0.45)
