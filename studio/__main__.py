@@ -6,10 +6,12 @@ Exit status: 0 done, 1 a check or a task failed, 2 wrong use. With `--json` the 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,7 +20,10 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from policy.config import PRESETS, TrainConfig
+from studio.index import Filters
 
 Data = Annotated[Path, arg(metavar="DIR", help="The data folder.")]
 Json = Annotated[bool, arg(name="json", help="Print one JSON value instead of text.")]
@@ -127,6 +132,69 @@ def demo(
     return int(bool(report.errors))
 
 
+def train(
+    task: Positional[Annotated[str, arg(metavar="TASK")]] = "",
+    config: OmitArgPrefixes[TrainConfig] = PRESETS["small"],
+    name: str | None = None,
+    resume: str | None = None,
+    episodes: int | None = None,
+    agent: str | None = None,
+    operator: str | None = None,
+    min_quality: int | None = None,
+    flags: tuple[str, ...] = (),
+    data: Data = DATA,
+    json: Json = False,
+) -> int:
+    """Learn a policy from the successful demonstrations of a task. Stopped, it can go on.
+
+    Args:
+        task: What was demonstrated; see `studio tasks`.
+        name: Of the run; task, policy and time if not given.
+        resume: A run to go on with, instead of a task and settings.
+        episodes: Learn from the first so many demonstrations that match.
+        agent: Only from what this agent demonstrated.
+        operator: Only from what this person demonstrated.
+        flags: All of these must be set.
+    """
+    from studio import training
+    from studio.api import Studio
+
+    if bool(task) == bool(resume):
+        raise ValueError("Give a task to begin a run, or --resume RUN to go on with one.")
+    if resume and config != PRESETS[config.preset]:
+        raise ValueError("A run goes on with the settings that it was begun with; leave out all others.")
+    quiet = json or not training.leads()
+    with Studio(data) as studio:
+        filters: Filters = {"agent": agent, "operator": operator, "min_quality": min_quality, "flags": flags}
+        run = studio.run(resume) if resume else studio.begin_run(task, config, name, episodes, filters)
+        total = run.config.steps - run.done
+        with _progress(f"{run.folder.name}, {len(run.takes)} takes", total, quiet=quiet) as advance:
+
+            def tell(metrics: Mapping[str, float]) -> None:
+                advance()
+                if "validation" in metrics and not quiet:
+                    errors.print(_training_line(metrics))
+
+            result = studio.train(run, on_step=tell)
+    if json and training.leads():
+        _print_json(result)
+    elif training.leads():
+        end = (
+            "Finished" if result.is_finished else f"Stopped; studio train --resume {run.folder.name} goes on"
+        )
+        console.print(f"{end}: step {result.step} of {run.config.steps}, {run.folder}", soft_wrap=True)
+    return 0
+
+
+def _training_line(metrics: Mapping[str, float]) -> str:
+    """Losses, and mean errors of a chunk on the demonstrations kept aside."""
+    told = [f"step {metrics['step']}", f"loss {metrics['loss']:.3f}"]
+    units = {"position_mm": "mm", "rotation_deg": "°", "joints_deg": "°", "stiffness_N_per_m": "N/m"}
+    told.append(f"on others {metrics['validation']:.3f}")
+    told += [f"{metrics[name]:.1f} {unit}" for name, unit in units.items() if name in metrics]
+    return ", ".join(told)
+
+
 def evaluate(
     agent: Positional[Annotated[str, arg(metavar="AGENT")]],
     task: str | None = None,
@@ -198,6 +266,36 @@ def evaluate(
         if comparison:
             console.print(str(comparison))
     return int(any(rollout.error is not None for rollout in found.rollouts))
+
+
+def report(
+    agents: Positional[Annotated[tuple[str, ...], arg(metavar="RUN")]],
+    task: str | None = None,
+    out: Path = Path("report"),
+    data: Data = DATA,
+    json: Json = False,
+) -> int:
+    """Draw evaluations side by side: force, stiffness and drawings as figures, and a table.
+
+    Args:
+        agents: Evaluations by id or path, or runs and references whose newest one is meant.
+        task: Where an agent was evaluated on several.
+        out: Folder for figures and table.
+    """
+    from studio import report as reports
+    from studio.api import Studio
+
+    with Studio(data) as studio:
+        evaluations = [studio.evaluation(name, task) for name in agents]
+        written = reports.write(evaluations, studio.open, out)
+    if json:
+        _print_json({"files": written, "evaluations": [found.summary() for found in evaluations]})
+    else:
+        print(reports.table(evaluations))
+        for sentence in reports.pairs(evaluations):
+            console.print(sentence)
+        console.print(f"Written to {out}: {', '.join(path.name for path in written)}", soft_wrap=True)
+    return 0
 
 
 def probe(task: Positional[TaskName], episodes: int = 200, seed: int = 0, json: Json = False) -> int:
@@ -538,7 +636,9 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "tasks": show_tasks,
     "doctor": doctor,
     "demo": demo,
+    "train": train,
     "evaluate": evaluate,
+    "report": report,
     "probe": probe,
     "policy-server": policy_server,
     "episodes": episodes,
@@ -556,7 +656,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit."""
     status: int = 2
     try:
-        status = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="studio", args=arguments)
+        commands = COMMANDS | {"train": _train_with(sys.argv[1:] if arguments is None else arguments)}
+        status = tyro.extras.subcommand_cli_from_dict(commands, prog="studio", args=arguments)
     except KeyboardInterrupt:
         _complain("Interrupted.")
         status = 130
@@ -566,6 +667,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _complain(str(error))
         status = 1
     sys.exit(status)
+
+
+def _train_with(arguments: Sequence[str]) -> Callable[..., int]:
+    """`train` with the settings of the preset that is asked for as its defaults, which `--help` shows."""
+    asked = [value for name, value in itertools.pairwise(arguments) if name == "--preset"]
+    asked += [name.partition("=")[2] for name in arguments if name.startswith("--preset=")]
+    chosen = next((config for preset, config in PRESETS.items() if preset in asked), PRESETS["small"])
+    return functools.partial(train, config=chosen)
 
 
 def _say(text: str) -> None:

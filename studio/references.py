@@ -190,18 +190,21 @@ def _average_of(task: str, spread: float) -> list[Action]:
     """The mean motion of the demonstrations of `AVERAGED`.
 
     Averaged phase by phase, each stretched to its mean length; a phase ends where a stiffness changes, or a
-    hand begins or ends to open or close. Demonstrations with other phases than most are left out.
+    hand begins or ends to open or close. Only demonstrations with the usual phases count, and of these the
+    half that is nearest to the most central one: the mean of two ways to go about it would be neither.
     """
     twin = Twin(tasks.load(task))
     homes = np.array([arm.world_from_home.wxyz for arm in twin.task.arms])
     phased = [_phases(demonstrated(twin, seed, spread).actions, homes) for seed in AVERAGED]
     usual, _ = Counter(keys for keys, _ in phased).most_common(1)[0]
     alike = [phases for keys, phases in phased if keys == usual]
-    rows = []
-    for phase in zip(*alike, strict=True):  # each (ticks, arms, columns)
-        length = round(np.mean([len(part) for part in phase]))
-        rows.append(np.mean([_stretched(part, length) for part in phase], axis=0))
-    return [Action(tuple(map(_action_of, row))) for row in np.concatenate(rows)]
+    lengths = [round(np.mean([len(part) for part in phase])) for phase in zip(*alike, strict=True)]
+    motions = np.array(
+        [np.concatenate([_stretched(*p) for p in zip(phases, lengths, strict=True)]) for phases in alike]
+    )  # (demonstrations, ticks, arms, columns)
+    apart = np.linalg.norm(motions[:, None, ..., :3] - motions[None, ..., :3], axis=-1).mean(axis=(2, 3))
+    nearest = np.argsort(apart[apart.sum(axis=0).argmin()])[: (len(motions) + 1) // 2]
+    return [Action(tuple(map(_action_of, row))) for row in motions[nearest].mean(axis=0)]
 
 
 _Key = tuple[tuple[float, int], ...]  # per arm: stiffness [N/m]; -1 while it closes, 1 while it opens

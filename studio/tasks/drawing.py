@@ -241,12 +241,17 @@ def likeness(grid: Array) -> float:
     return float((same / most).mean())
 
 
-@cache
-def _reference_face() -> Array:
+def reference() -> Board:
+    """A board with the smile as it is meant."""
     board = Board()
     for line in smile():
         board.draw(line, LINE_RADIUS)
-    return _face(board.grid)
+    return board
+
+
+@cache
+def _reference_face() -> Array:
+    return _face(reference().grid)
 
 
 def _face(grid: Array) -> Array:
