@@ -121,15 +121,19 @@ class Act(nn.Module):
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """The scalar `loss`, and what it is made of: L1 of each group, KL of the latent."""
+        if not self.has_cvae:
+            return self.errors(self(batch), batch)
+        mean, log_variance = self.posterior(batch, batch.action, batch.valid)
+        latent = mean + torch.exp(log_variance / 2) * torch.randn_like(mean)
+        kl = -0.5 * (1 + log_variance - mean**2 - log_variance.exp()).sum(-1).mean()
+        told = self.errors(self._actions(batch, latent), batch)
+        return {**told, "loss": told["loss"] + self.kl_weight * kl, "kl": kl.detach()}
+
+    def errors(self, actions: Tensor, batch: Batch) -> dict[str, Tensor]:
+        """Weighted L1 of predicted actions (B, chunk, action width) as `loss`, and that of each group."""
         assert batch.action is not None
         assert batch.valid is not None
-        latent = batch.state.new_zeros(len(batch.state), self.latent)
-        kl = None
-        if self.has_cvae:
-            mean, log_variance = self.posterior(batch, batch.action, batch.valid)
-            latent = mean + torch.exp(log_variance / 2) * torch.randn_like(mean)
-            kl = -0.5 * (1 + log_variance - mean**2 - log_variance.exp()).sum(-1).mean()
-        error = (self._actions(batch, latent) - batch.action).abs()  # (B, chunk, width)
+        error = (actions - batch.action).abs()
         valid = batch.valid.to(error.dtype)
         # The mean over a chunk's valid steps, then over the chunks: each moment of a take counts the same.
         of_chunk = (error * valid[..., None]).sum(1) / valid.sum(1).clamp(min=1)[:, None]  # (B, width)
@@ -137,10 +141,7 @@ class Act(nn.Module):
         told: dict[str, Tensor] = {
             name: l1[columns].mean().detach() for name, columns in self._groups.items()
         }
-        loss = (l1 * self.loss_weights).sum()
-        if kl is None:
-            return {"loss": loss, **told}
-        return {"loss": loss + self.kl_weight * kl, **told, "kl": kl.detach()}
+        return {"loss": (l1 * self.loss_weights).sum(), **told}
 
     def _actions(
         self, batch: Batch, latent: Tensor, hide_images: bool = False, hide_wrench: bool = False

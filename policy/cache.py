@@ -50,8 +50,8 @@ def build(
                     writer.add(recording)
                     on_take(recording.name)
         writer.finish(part)
-        shutil.rmtree(folder, ignore_errors=True)
-        part.rename(folder)
+        if not folder.exists():  # another process may have been faster
+            part.rename(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
 

@@ -21,7 +21,7 @@ from policy.config import TrainConfig
 from policy.features import Control, Features
 
 FORMAT = 1
-CHECKPOINTS = "checkpoints"
+CHECKPOINTS, CONFIG = "checkpoints", "config.json"  # in the folder of a run
 MODEL, TRAINING, DESCRIPTION = "model.safetensors", "training.safetensors", "checkpoint.json"
 
 

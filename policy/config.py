@@ -45,6 +45,7 @@ class TrainConfig:
 
     # Network
     backbone: Literal["cnn", "resnet18"] = "cnn"
+    """What reads the images: a small network of our own, or ResNet-18."""
     backbone_weights: str = ""
     """File with torchvision's ResNet-18 weights (.pth or .safetensors); without, it learns from nothing."""
     width: int = 128

@@ -30,8 +30,8 @@ from policy.features import Features
 from policy.machine import Machine
 from policy.vision import ResNet18
 
-VALIDATED = 256  # samples at most, evenly over the takes kept aside
-METRICS, CONFIG = "metrics.jsonl", "config.json"
+VALIDATED = 128  # samples at most, evenly over the takes kept aside
+METRICS = "metrics.jsonl"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of AdamW
 
 
@@ -84,7 +84,7 @@ class Learner:
             names = [take.name for take in dataset.takes]
             fields: dict[str, Any] = {"task": dataset.task, "data": dataset.folder.name, "takes": names}
             fields |= {"config": dataclasses.asdict(config), "versions": versions()}
-            (run / CONFIG).write_text(json.dumps(fields, indent=1))
+            (run / checkpoint.CONFIG).write_text(json.dumps(fields, indent=1))
         return Learner(config, dataset, run, here, features)
 
     # A step
@@ -134,16 +134,16 @@ class Learner:
     # Validation
 
     def validate(self) -> dict[str, float]:
-        """The averaged network on the takes kept aside: loss, and errors in units a person knows."""
+        """The averaged network on the takes kept aside, as it will run: loss, and errors in known units."""
         if not len(self._aside):
             return {}
         losses, errors = [], []
         for indices in np.array_split(self._aside, math.ceil(len(self._aside) / self.config.batch)):
             batch = self.batches.of(indices).to(self.machine.device)
             with torch.no_grad(), self.machine.autocast():
-                losses.append(self.averaged.loss(batch)["loss"].item() * len(indices))
-                values = self.averaged(batch).float().cpu().numpy()
-            errors.append(self._errors(values.astype(float), indices))
+                values = self.averaged(batch)
+                losses.append(self.averaged.errors(values, batch)["loss"].item() * len(indices))
+            errors.append(self._errors(values.double().cpu().numpy(), indices))
         self._validation = sum(losses) / len(self._aside)
         self.is_best = self.best is None or self._validation < self.best
         self.best = self._validation if self.is_best else self.best

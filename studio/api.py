@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import getpass
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from controller.servo import ServoConfig
 from controller.stiffness import StiffnessTable
+from policy.config import TrainConfig
 from studio import replay as replays
-from studio import tasks
+from studio import tasks, training
 from studio.catalog import Catalog, Refreshed
 from studio.episode import Episode, open_episode
 from studio.evaluate import Plan, evaluate
@@ -25,6 +26,9 @@ from studio.recovery import Recovery, recover_all
 from studio.session import Agent
 from studio.station import Station, Take
 from studio.twin import Twin
+
+if TYPE_CHECKING:
+    from policy.train import TrainResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +120,33 @@ class Studio:
                 make_agent, agent_name=agent_name, seed=seed, spread=spread, operator=operator
             )
         return self.catalog.add(take.path)
+
+    def begin_run(
+        self,
+        task: str,
+        config: TrainConfig,
+        name: str | None = None,
+        episodes: int | None = None,
+        filters: Filters | None = None,
+    ) -> training.Run:
+        """A run that learns a task from successful demonstrations, or from those that `filters` ask for."""
+        tasks.load(task)
+        return training.prepare(self.catalog, task, config, name=name, episodes=episodes, filters=filters)
+
+    def run(self, name: str) -> training.Run:
+        """One that was begun, to go on with."""
+        return training.reopen(self.catalog, name)
+
+    def train(
+        self,
+        run: training.Run,
+        *,
+        on_take: Callable[[str], None] = lambda name: None,
+        on_step: Callable[[Mapping[str, float]], None] = lambda metrics: None,
+    ) -> TrainResult:
+        """Read the takes of a run, then let it learn until it is finished, or SIGTERM or SIGINT comes."""
+        dataset = training.dataset_of(self.catalog, run, on_take)
+        return training.train(run, dataset, on_step=on_step)
 
     def evaluate(
         self, plan: Plan, *, workers: int = 1, on_rollout: Callable[[Rollout], None] = lambda rollout: None

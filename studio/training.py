@@ -1,0 +1,235 @@
+"""From recorded takes to a trained policy: which takes, read once into a cache, and where the run lies.
+
+    DATA/cache/<key>/    pictures and tracks of the takes, see `policy.dataset`; may be deleted
+    DATA/runs/<name>/    takes.json: what the run learns from
+                         config.json: its settings; metrics.jsonl: one line a step; checkpoints/
+
+A run keeps learning from the takes as they were when it began, whatever is edited meanwhile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from controller.types import Array
+from policy.cache import Size, build
+from policy.checkpoint import CONFIG, read_spec
+from policy.config import TrainConfig
+from policy.dataset import FORMAT, Dataset
+from policy.recording import ArmTrack, Recording
+from studio.catalog import Catalog
+from studio.episode import Episode, open_episode
+from studio.index import EpisodeRow, Filters
+
+if TYPE_CHECKING:
+    from policy.train import TrainResult
+
+EVALUATION = "evaluation"  # operator of rollouts, which are not demonstrations
+CACHE_TIMEOUT = 3600.0  # [s] that a process of a run waits for the one that reads the takes
+TAKES = "takes.json"
+
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """One take to learn from, as it was when the run began."""
+
+    episode_id: str
+    trim: tuple[float, float] | None = None  # [s] since the take's start
+
+    @staticmethod
+    def from_json(fields: Mapping[str, Any]) -> Chosen:
+        trim = fields["trim"]
+        return Chosen(fields["episode_id"], None if trim is None else (trim[0], trim[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Where a run lies and what it learns from; `prepare` makes one, `train` lets it learn."""
+
+    folder: Path
+    task: str
+    config: TrainConfig
+    takes: tuple[Chosen, ...]
+    done: int = 0  # steps
+
+    @property
+    def is_begun(self) -> bool:
+        return self.done > 0
+
+
+def prepare(
+    catalog: Catalog,
+    task: str,
+    config: TrainConfig,
+    *,
+    name: str | None = None,
+    episodes: int | None = None,
+    filters: Filters | None = None,
+) -> Run:
+    """A new run of successful demonstrations of a task, or of those that `filters` ask for.
+
+    `episodes` takes the first so many recorded. Raises ValueError where none matches.
+    """
+    name = name or f"{task}-{config.policy}-{time.strftime('%Y%m%d-%H%M%S')}"
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{name!r} cannot name a run; use letters, digits, - _ .")
+    folder = catalog.data_dir / "runs" / name
+    if folder.exists() and leads():
+        raise ValueError(f"There is a run {name} already; resume it, or give another name.")
+    catalog.refresh()
+    asked: Filters = {"outcome": "success", **(filters or {})}
+    rows = _select(catalog, {**asked, "task": task})
+    if not rows:
+        raise ValueError(_why_none(catalog, task, asked))
+    if episodes is not None and not 1 <= episodes <= len(rows):
+        raise ValueError(f"{len(rows)} takes match, so that many or fewer can be asked for, not {episodes}.")
+    takes = tuple(Chosen(row.episode_id, row.trim) for row in rows[:episodes])
+    return Run(folder, task, config, takes)
+
+
+def reopen(catalog: Catalog, name: str) -> Run:
+    """A run that was stopped, by its name or folder."""
+    runs = catalog.data_dir / "runs"
+    folder = next((path for path in (runs / name, Path(name)) if (path / CONFIG).exists()), None)
+    if folder is None:
+        raise KeyError(
+            f"No run {name!r}; there are {sorted(p.parent.name for p in runs.glob(f'*/{CONFIG}'))}."
+        )
+    told = json.loads((folder / CONFIG).read_text())
+    takes = tuple(map(Chosen.from_json, json.loads((folder / TAKES).read_text())))
+    try:
+        done = read_spec(folder).step
+    except FileNotFoundError:
+        done = 0  # stopped before its first checkpoint
+    return Run(folder, told["task"], TrainConfig.from_json(told["config"]), takes, done)
+
+
+def dataset_of(catalog: Catalog, run: Run, on_take: Callable[[str], None] = lambda name: None) -> Dataset:
+    """The cache of a run's takes, read once; `on_take` hears of each take as it is read.
+
+    One process on each machine reads, the others wait. Raises ValueError, naming the take, where takes are
+    not alike, KeyError where one is gone.
+    """
+    size = (run.config.max_height, run.config.max_width) if run.config.images else None
+    folder = catalog.data_dir / "cache" / _key(run.takes, size)
+    if (folder / "index.json").exists():
+        return Dataset(folder)
+    if int(os.environ.get("LOCAL_RANK", 0)) == 0:
+        paths = [(catalog.get(take.episode_id).path, take.trim) for take in run.takes]
+        recordings = [lambda p=path, t=trim: recording_of(p, t) for path, trim in paths]
+        build(folder, recordings, max_size=size, on_take=on_take)
+    deadline = time.monotonic() + CACHE_TIMEOUT
+    while not (folder / "index.json").exists():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"The process that reads the takes has not finished {folder}.")
+        time.sleep(0.2)
+    return Dataset(folder)
+
+
+def train(
+    run: Run,
+    dataset: Dataset,
+    *,
+    on_step: Callable[[Mapping[str, float]], None] = lambda metrics: None,
+) -> TrainResult:
+    """Let a run learn, or go on, until it is finished or SIGTERM comes. Loads torch.
+
+    `on_step` hears the metrics of each step. Under `torchrun` each process calls this.
+    """
+    from policy.train import train as learn
+
+    if leads() and not (run.folder / TAKES).exists():
+        run.folder.mkdir(parents=True, exist_ok=True)
+        (run.folder / TAKES).write_text(
+            json.dumps([dataclasses.asdict(take) for take in run.takes], indent=1)
+        )
+    return learn(run.config, dataset, run.folder, resume=run.is_begun, tell=on_step)
+
+
+def leads() -> bool:
+    """Whether this process is the only one of a run, or the one that tells and saves."""
+    return int(os.environ.get("RANK", 0)) == 0
+
+
+@contextmanager
+def recording_of(path: Path, trim: tuple[float, float] | None) -> Iterator[Recording]:
+    """A take as training reads it."""
+    with open_episode(path) as episode:
+        yield _TakeRecording(episode, trim)
+
+
+class _TakeRecording:
+    """Implements `policy.recording.Recording`."""
+
+    def __init__(self, episode: Episode, trim: tuple[float, float] | None) -> None:
+        header = episode.header
+        self.name = header.episode_id
+        self.task = header.task
+        self.arms = header.arms
+        self.cameras: Mapping[str, Size] = {
+            name: (height, width) for name, (width, height) in header.cameras.items()
+        }
+        self._episode = episode
+        start = float(episode.columns(f"{self.arms[0]}/state")[f"{self.arms[0]}/state/time"][0])
+        self.span = (start, float("inf")) if trim is None else (start + trim[0], start + trim[1])
+
+    def track(self, arm: str) -> ArmTrack:
+        columns = self._episode.columns(f"{arm}/state", f"{arm}/applied")
+        state = {name: columns[f"{arm}/state/{name}"] for name in _STATE}
+        return ArmTrack(
+            state_time=columns[f"{arm}/state/time"],
+            action_time=columns[f"{arm}/applied/time"],
+            base_from_target=columns[f"{arm}/applied/base_from_target"],
+            stiffness=columns[f"{arm}/applied/stiffness"],
+            gripper_command=columns[f"{arm}/applied/gripper"],
+            **state,
+        )
+
+    def image_times(self, camera: str) -> Array:
+        return self._episode.image_times(camera)
+
+    def image(self, camera: str, index: int) -> Array:
+        return self._episode.image(camera, index)
+
+
+_STATE = ("base_from_tcp", "q", "q_command", "wrench", "gripper")
+
+
+def _select(catalog: Catalog, filters: Filters) -> list[EpisodeRow]:
+    """Those that match, as they were recorded; rollouts of an evaluation only where they are asked for."""
+    rows = catalog.episodes(sort="started", descending=False, limit=None, **filters)
+    return [row for row in rows if filters.get("operator") or row.operator != EVALUATION]
+
+
+def _why_none(catalog: Catalog, task: str, filters: Filters) -> str:
+    rows = _select(catalog, {"task": task})
+    asked = ", ".join(f"{name} {value}" for name, value in filters.items() if value)
+    if not rows:
+        known = ", ".join(catalog.facets()["task"]) or "none at all"
+        return (
+            f"No demonstration of {task!r} in {catalog.data_dir}; there are takes of {known}. "
+            f"Record some: studio demo {task} --episodes 30"
+        )
+    outcomes = ", ".join(
+        f"{sum(row.outcome == outcome for row in rows)} {outcome}"
+        for outcome in ("success", "failure", "unmarked")
+    )
+    return f"Of the {len(rows)} demonstrations of {task!r} ({outcomes}) none has {asked}."
+
+
+def _key(takes: Sequence[Chosen], size: Size | None) -> str:
+    """Names a cache by all that decides what is in it; recordings never change."""
+    told = [FORMAT, size, [(take.episode_id, take.trim) for take in takes]]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
