@@ -268,6 +268,40 @@ def evaluate(
     return int(any(rollout.error is not None for rollout in found.rollouts))
 
 
+def show_references(
+    named: Positional[Annotated[tuple[str, ...], arg(metavar="TASK")]] = (),
+    episodes: int = 20,
+    seed: int = 3000,
+    data: Data = DATA,
+    workers: int = 1,
+    json: Json = False,
+) -> int:
+    """Evaluate every reference on some tasks, or on all: what a policy has to be measured against.
+
+    Args:
+        named: The tasks.
+        episodes: How many of each; their seeds are seed, seed + 1, …
+        seed: Of the first episode.
+        workers: Processes that roll out side by side.
+    """
+    from studio import report as reports
+    from studio import tasks
+    from studio.api import Studio
+    from studio.evaluate import Plan
+    from studio.references import REFERENCES
+
+    seeds = tuple(range(seed, seed + episodes))
+    plans = [
+        Plan(agent=agent, task=task, seeds=seeds) for task in named or tasks.names() for agent in REFERENCES
+    ]
+    with Studio(data) as studio, _progress("references", len(plans) * episodes, quiet=json) as advance:
+        found = [
+            studio.evaluate(plan, workers=workers, on_rollout=lambda rollout: advance()) for plan in plans
+        ]
+    _print_json([one.summary() for one in found]) if json else print(reports.table(found))
+    return int(any(one.summary()["errors"] for one in found))
+
+
 def report(
     agents: Positional[Annotated[tuple[str, ...], arg(metavar="RUN")]],
     task: str | None = None,
@@ -638,6 +672,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "train": train,
     "evaluate": evaluate,
+    "references": show_references,
     "report": report,
     "probe": probe,
     "policy-server": policy_server,

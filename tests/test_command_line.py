@@ -15,6 +15,7 @@ from test_api import doctored
 from studio import __main__ as command_line
 from studio import recorder
 from studio.api import DemoReport, Studio
+from studio.references import REFERENCES
 
 ROOT = Path(__file__).parent.parent
 DEMO_KEYS = {"task", "episodes", "successes", "seeds", "mean_force_N", "max_force_N", "ids"}
@@ -244,3 +245,16 @@ def test_evaluate_refuses_nonsense(studio: Run, tmp_path: Path) -> None:
         status, _, complaint = studio("evaluate", *arguments, "--data", tmp_path)
         assert status == 2
         assert words in complaint
+
+
+def test_references_are_one_table(studio: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in REFERENCES.keys() - {"demonstrator", "all-high"}:
+        monkeypatch.delitem(REFERENCES, name)
+    arguments = ("references", "wiping", "--episodes", 1, "--data", tmp_path)
+    status, text, _ = studio(*arguments)
+    assert status == 0
+    assert [row.split(" | ")[1] for row in text.splitlines()[2:]] == ["demonstrator", "all-high"]
+    report = ("report", "demonstrator", "all-high", "--data", tmp_path, "--out", tmp_path / "out", "--json")
+    told = last_json(studio(*report)[1])
+    assert [evaluation["run"] for evaluation in told["evaluations"]] == ["demonstrator", "all-high"]
+    assert {Path(path).name for path in told["files"]} == {path.name for path in (tmp_path / "out").iterdir()}
