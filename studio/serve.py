@@ -30,6 +30,8 @@ from controller.stiffness import StiffnessTable
 from studio import cert, invitation, tasks
 from studio.api import Studio
 from studio.cert import Certificate
+from studio.door import person_of
+from studio.headset import add_xr
 from studio.link import socket_path
 from studio.messages import Shutdown
 from studio.proxy import LOOPBACK
@@ -176,6 +178,7 @@ def serve(
             health=lambda: health(page.remote, process, len(viewer.get_clients())),
             reception=gate.receive,
         )
+        add_xr(app, page.remote, lambda socket: gate.lease.sit(person_of(socket), "headset"), page.model)
         front = FrontServer(app, host, port, token=token, certificate=certificate)
         stack.enter_context(front)
         _write(lock, front.url)

@@ -74,9 +74,15 @@ class Page:
         self.remote, self._gate = gate.remote, gate
         gate.attach(server)
         self._server, self._studio, self._process = server, studio, process
-        self._desk = Desk(self.remote, studio.delete, studio.restore, operator=lambda: gate.lease.holder_name)
+        self._desk = Desk(
+            self.remote,
+            studio.delete,
+            studio.restore,
+            operator=lambda: gate.lease.holder_name,
+            runs_of=studio.runs_of,
+        )
         self._invitation = invitation
-        self._model = cache(scene.SceneModel)
+        self.model = cache(scene.SceneModel)
         self._stage: Stage | None = None
         self._restarting = threading.Lock()
         self._painted = 0  # frames that had come when the last was painted
@@ -146,7 +152,7 @@ class Page:
             server,
             tabs.add_tab("Episodes"),
             self._studio.catalog,
-            model=self._model,
+            model=self.model,
             author=self._author,
             mark=lambda episode_id, is_deleted: self._desk.mark(episode_id, is_deleted=is_deleted),
         )
@@ -237,7 +243,7 @@ class Page:
             return
         if self._stage is not None:
             self._stage.remove()
-        self._stage = Stage(self._server, self._live, self._model(status.task), self._desk, self.remote)
+        self._stage = Stage(self._server, self._live, self.model(status.task), self._desk, self.remote)
         names = tuple(arm.name for arm in self._stage.model.task.arms)
         self._teleop.set_task(self._stage.model.task.arms)
         keys: list[Hotkey] = self._hotkeys.set_arms(names)
@@ -296,9 +302,11 @@ class Stage:
             [Pose.from_vector(np.array(arm.base_from_target)) for arm in frame.arms],
             [arm.level for arm in frame.arms],
         )
-        is_by_gizmo = active_choice(status, self._desk.choice) == "gizmo"
+        choice = active_choice(status, self._desk.choice)
         for gizmo, arm in zip(self._gizmos, status.arms, strict=True):
-            gizmo.show(frame, visible=is_by_gizmo and arm.engaged)
+            is_led = arm.hand is not None and arm.hand.engaged
+            is_handle = (choice == "gizmo" and arm.engaged) or choice == "policy"  # grabbing it takes over
+            gizmo.show(frame, visible=is_handle and not is_led)
         self._plots.update(frame.arms)
         self._previews.show(self._remote.images, status.camera_error)
         self._show_ink()
