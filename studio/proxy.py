@@ -187,7 +187,8 @@ async def _listen(browser: WebSocket, viser: ClientConnection, visit: Visit | No
         try:
             heard = visit.hear(said) if visit else said
         except Unheard as error:
-            logger.warning("Closed a browser's connection: %s", error)
+            told = str(error).encode("unicode_escape").decode()  # a log is no place for line breaks of others
+            logger.warning("Closed a browser's connection: %.200s", told)
             with suppress(WebSocketDisconnect):
                 await browser.close(CloseCode.POLICY_VIOLATION, "This is no message of our page; reload it.")
             return CloseCode.POLICY_VIOLATION, ""

@@ -169,10 +169,10 @@ class Gate:
                 pass
             case Input():
                 widget = self._shared(said.uuid)
-                if widget is not None and said.uuid not in self._free:
-                    seat.admit()
                 if widget is not None and not _fits(said.updates.value, widget.value):
                     raise Unheard(f"{said.updates.value!r} for a widget that shows {widget.value!r}")
+                if widget is not None and said.uuid not in self._free:
+                    seat.admit()
             case Held():
                 if self._shared(said.uuid) is not None:
                     seat.admit(takes=False)
