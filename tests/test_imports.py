@@ -36,7 +36,7 @@ LAYERS = (
     ("channels", "schema", "edits", "index", "doctor"),
     ("episode", "episode_writer", "recovery", "tasks", "session"),
     ("twin", "cameras", "inputs"),
-    ("recorder", "catalog", "replay", "evaluate", "jobs", "export"),
+    ("recorder", "catalog", "replay", "training", "evaluate", "jobs", "export"),
     ("api",),
     ("server", "headset", "ui", "serve", "__main__"),
 )
