@@ -642,6 +642,49 @@ def make_certificate(names: tuple[str, ...] = (), json: Json = False) -> int:
     return 0
 
 
+def steamvr(
+    data: Data = DATA,
+    scale: float = 1.0,
+    view: float = 0.0,
+    grip_as_clutch: bool = False,
+    one_arm: Literal["left", "right"] = "right",
+    dead_band: float = 3.0,
+    full: float = 50.0,
+    strength: float = 1.0,
+    countdown: float = 3.0,
+    operator: str = "",
+) -> int:
+    """Drive the running session of a data folder with Vive wands through SteamVR, until Ctrl-C.
+
+    Args:
+        scale: An arm's way to the hand's; rotations are never scaled.
+        view: Degrees by which you stand turned from the robot: 0 behind it, 180 facing it.
+        grip_as_clutch: An arm follows while the grip is held; the menu button switches stiffness.
+        one_arm: The hand that leads where there is one arm.
+        dead_band: Contact force in newtons from which on it vibrates.
+        full: Contact force in newtons at which it vibrates fully.
+        strength: Of the vibration, 0 to 1.
+        countdown: Seconds before recording.
+        operator: Your name, kept with each take.
+    """
+    from studio.inputs.controllers import GRIP_AS_CLUTCH, PAPER, Settings
+    from studio.inputs.haptics import Haptics
+    from studio.inputs.steamvr import drive
+    from studio.link import socket_path
+
+    settings = Settings(
+        mapping=GRIP_AS_CLUTCH if grip_as_clutch else PAPER,
+        haptics=Haptics(dead_band, full, strength),
+        scale=scale,
+        view=math.radians(view),
+        one_arm=one_arm,
+        countdown=countdown,
+        operator=operator,
+    )
+    drive(socket_path(data), settings, tell=_say)
+    return 0
+
+
 def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
     """Measure speed and contact on this machine: medians, with the load average beside them.
 
@@ -683,6 +726,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "restore": restore,
     "recover": recover,
     "replay": replay,
+    "steamvr": steamvr,
     "bench": bench,
 }
 

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from controller.types import Pose, multiply_quaternions, quaternion_of
+from controller.types import Array, Pose, multiply_quaternions, quaternion_of
 from studio.inputs.controllers import Button, Controller, Controllers, Mapping, Moment, Settings, Side
 from studio.inputs.haptics import Haptics
 from studio.messages import Name, Share, Status
@@ -31,7 +31,8 @@ Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]
 # a page, so B and Y stand in for the paper's menu button.
 STANDARD: tuple[Button, ...] = ("trigger", "squeeze", "pad", "stick", "primary", "menu")
 
-XR_FROM_OURS = quaternion_of(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
+AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # ours to WebXR's
+XR_FROM_OURS = quaternion_of(AXES)
 
 Reason = Literal["ended", "hidden", "blurred", "reset", "left"]
 WHY: dict[Reason, str] = {
@@ -126,6 +127,12 @@ def pose_of(xr: Sequence[float]) -> Pose:
     if not 0.9 < norm < 1.1:  # browsers send single precision
         raise ValueError(f"A quaternion with norm {norm:.3g}; a pose needs a unit quaternion.")
     return Pose(np.array([-z, -x, y]), wxyz / norm)
+
+
+def pose_of_matrix(xr: Array) -> Pose:
+    """In our axes, from (3, 4) in WebXR's, which are OpenVR's, too. Single precision is enough."""
+    first, _, third = np.linalg.svd(xr[:, :3])
+    return Pose.of(AXES.T @ (first @ third) @ AXES, AXES.T @ xr[:, 3])
 
 
 def stage_of(room_from_world: Pose) -> list[float]:
