@@ -377,7 +377,7 @@ def policy_server(
         once: End when the first client has left.
     """
     from studio import policy_link
-    from studio.evaluate import folder_of
+    from studio.pilot import folder_of
 
     policy_link.serve_policy(
         folder_of(agent, data), host, port, hide=hide, device=device, once=once, tell=_say

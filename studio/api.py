@@ -22,6 +22,7 @@ from studio.evaluate import Plan, evaluate
 from studio.evaluation import Evaluation, Rollout, find
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
+from studio.pilot import runs_of
 from studio.recovery import Recovery, recover_all
 from studio.session import Agent
 from studio.station import Station, Take
@@ -164,6 +165,10 @@ class Studio:
         evaluation = evaluate(plan, self.data_dir, workers=workers, on_rollout=index)
         self.catalog.refresh()  # also what a failed rollout has left
         return evaluation
+
+    def runs_of(self, task: str) -> list[str]:
+        """Names of the runs that have learned a task, the newest first."""
+        return runs_of(task, self.data_dir)
 
     def evaluation(self, name: str, task: str | None = None) -> Evaluation:
         """By path, by id, or the newest of an agent."""

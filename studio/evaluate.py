@@ -26,6 +26,7 @@ from policy.agent import ChunkExecutor, ExecutionMode, PolicySpec, load_policy, 
 from studio import tasks
 from studio.evaluation import Curves, Evaluation, Rollout
 from studio.inputs.policy import Immediate, PolicyAgent
+from studio.pilot import folder_of
 from studio.policy_link import connect_to, is_address
 from studio.recorder import new_episode_id, versions
 from studio.references import REFERENCES
@@ -89,7 +90,7 @@ class Plan:
                 with closing(connect_to(agent)) as policy:
                     spec = policy.spec
             else:
-                wanted = str(folder_of(agent, data_dir))
+                wanted = str(_folder_of(agent, data_dir))
                 spec = read_spec(Path(wanted))
         if task is None and spec is None:
             raise ValueError(f"Tell the task that {agent!r} shall do; there are {tasks.names()}.")
@@ -146,16 +147,11 @@ class Plan:
         return lambda twin: PolicyAgent(mind, self.execution, self.replan_every, seed=twin.seed)
 
 
-def folder_of(agent: str, data_dir: Path) -> Path:
-    """Of a run or checkpoint, by path or by the name of a run."""
-    for folder in (Path(agent), data_dir / "runs" / agent):
-        if folder.is_dir():
-            return folder
-    runs = sorted(folder.name for folder in (data_dir / "runs").glob("*/"))
-    raise KeyError(
-        f"No agent {agent!r}: neither a folder, nor among the runs {runs or 'of ' + str(data_dir)} and the "
-        f"references {sorted(REFERENCES)}."
-    )
+def _folder_of(agent: str, data_dir: Path) -> Path:
+    try:
+        return folder_of(agent, data_dir)
+    except KeyError as error:
+        raise KeyError(f"{error.args[0]} References are {sorted(REFERENCES)}.") from None
 
 
 @dataclass(slots=True)

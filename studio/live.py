@@ -32,6 +32,7 @@ from studio.episode import Header
 from studio.inputs.operator import HandOfOperator, OperatorAgent, step_of
 from studio.inputs.scripted import ScriptedAgent
 from studio.link import Hub, socket_path
+from studio.pilot import Pilot
 from studio.recorder import Recorder
 from studio.session import CONTROL_PERIOD, Agent, Clock, Session
 from studio.station import header_of
@@ -79,6 +80,7 @@ class LiveSession:
         self._driver: m.Driver = "nobody"
         self._collector: m.Driver = "operator"  # who drives again after each reset while collecting
         self._operator = ""
+        self._pilot = Pilot(data_dir)
         self._takes = Takes(Recorder(data_dir), self._header, self._tell)
         self._limits: dict[int, tuple[float, Limit]] = {}  # newest of each arm, and when [s]
         self._told_state: dict[str, bytes] = {}
@@ -104,6 +106,7 @@ class LiveSession:
             self._robot.hold()
             self._takes.keep(None, "the session ended", self._robot.progress())
             self._close_cameras()
+            self._pilot.close()
 
     def _advance(self) -> None:
         """One tick of the robot."""
@@ -129,6 +132,9 @@ class LiveSession:
             self._reset(m.Reset(seed=seed, spread=self._robot.spread))
             self._takes.start(self._takes.collection.countdown)
             self._set_driver(driver, self._operator)
+        if self._driver == "policy" and self._pilot.error:
+            self._tell("error", f"{self._pilot.error} The arms hold.")
+            self._set_driver("nobody", self._operator)
         self._watch_for_clients()
 
     def _watch_for_clients(self) -> None:
@@ -159,10 +165,12 @@ class LiveSession:
     def _execute(self, command: m.Command) -> None:
         match command:
             case m.MoveTo():
+                self._take_over()
                 self._hands.move_to(
                     self._arm(command.arm), Pose(np.array(command.position), np.array(command.wxyz))
                 )
             case m.Nudge():
+                self._take_over()
                 self._hands.nudge(self._arm(command.arm), step_of(command.translation, command.rotation))
             case m.Mirror():
                 self._hands.mirror(command.mirrored)
@@ -187,7 +195,7 @@ class LiveSession:
             case m.OperatorLeft():
                 self._let_hold()
             case m.Drive():
-                self._set_driver(command.driver, command.operator)
+                self._set_driver(command.driver, command.operator, command.policy)
             case m.Reset():
                 self._reset(command)
             case m.StartTake():
@@ -250,27 +258,40 @@ class LiveSession:
         if self._driver not in ("nobody", "script"):
             self._set_driver("nobody", self._operator)
 
-    def _set_driver(self, driver: m.Driver, operator: str) -> None:
+    def _take_over(self) -> None:
+        """A person who grabs an arm drives it, in place of a policy."""
+        if self._driver == "policy":
+            self._set_driver("operator", self._operator)
+
+    def _set_driver(self, driver: m.Driver, operator: str, policy: str = "") -> None:
+        agent: Agent = self._hands
+        if driver == "policy":
+            agent = self._pilot.agent(policy or self._pilot.run, self._robot.task)
+        elif driver == "script":
+            agent = ScriptedAgent(self._robot, self._robot.seed)
         self._driver, self._operator = driver, operator
-        if self._agent is not self._hands:  # the grippers, too, stay as they are
-            for hand, robot in zip(self._hands.hands, self._robot.arms, strict=True):
-                hand.gripper = robot.servo.gripper
+        if self._agent is not self._hands:  # grippers and stiffness, too, stay as they are
+            for index, hand in enumerate(self._hands.hands):
+                hand.gripper = self._robot.arms[index].servo.gripper
+                if (mode := self._mode_in_force(index)) in self._robot.task.arms[index].modes:
+                    hand.mode = mode
         for arm, hand in enumerate(self._hands.hands):
             if driver == "operator":
                 hand.engage(self._robot.arms[arm].servo.target)
             else:
                 hand.park()
-        if driver == "script":
-            self._agent = ScriptedAgent(self._robot, self._robot.seed)
-            self._agent.reset(self._robot.observe())
-        else:
-            self._agent = self._hands
-        self._takes.add_event("driver", f"{driver} {operator}".strip())
+        agent.reset(self._robot.observe())
+        self._agent = agent
+        who = self._pilot.run if driver == "policy" else operator
+        self._takes.add_event("driver", f"{driver} {who}".strip())
 
     def _reset(self, command: m.Reset) -> None:
         if self._takes.phase != "idle":
             raise ValueError("A take is being recorded; stop it before resetting.")
-        driver = self._driver if self._driver != "script" else "nobody"
+        is_other = command.task not in (None, self._robot.task.name)
+        driver = self._driver
+        if driver == "script" or (driver == "policy" and is_other):
+            driver = "nobody"
         self._load(command.task or self._robot.task.name, command.seed, command.spread)
         self._set_driver(driver, self._operator)
         self._clock.restart()
@@ -300,11 +321,13 @@ class LiveSession:
     def _header(self) -> Header:
         """Of a take that begins now; its time begins with it."""
         self._robot.restart_time()
+        names = {"operator": "operator", "script": "scripted", "nobody": "nobody", "policy": self._pilot.run}
         return header_of(
             self._robot,
-            agent={"operator": "operator", "script": "scripted", "nobody": "nobody"}[self._driver],
+            agent=names[self._driver],
             operator=self._operator or None,
             has_images=self._cameras is not None and self._cameras.error is None,
+            provenance=self._pilot.provenance if self._driver == "policy" else None,
         )
 
     def _start_collecting(self, command: m.Collect) -> None:
@@ -391,6 +414,8 @@ class LiveSession:
             resets=self._resets,
             driver=self._driver,
             operator=self._operator,
+            policy=self._pilot.run,
+            policy_late=self._pilot.late,
             phase=takes.phase,
             countdown=takes.countdown,
             take_seconds=takes.seconds,
@@ -411,8 +436,11 @@ class LiveSession:
 
     def _mode_of(self, arm: int) -> StiffnessMode:
         """The mode in force where someone else than the operator drives, else the operator's choice."""
-        if self._driver != "script":
+        if self._driver not in ("script", "policy"):
             return self._hands.hands[arm].mode
+        return self._mode_in_force(arm)
+
+    def _mode_in_force(self, arm: int) -> StiffnessMode:
         return nearest_mode(self._robot.arms[arm].servo.stiffness, self._config.stiffness_table)
 
     def _tell(self, kind: m.NoticeKind, text: str, take: m.TakeStatus | None = None) -> None:

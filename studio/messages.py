@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from controller.types import Array
 
-Driver = Literal["nobody", "operator", "script"]
+Driver = Literal["nobody", "operator", "script", "policy"]
 Level = Literal["ok", "limited", "refused"]  # of the last target: passed, cut back, not followed
 Phase = Literal["idle", "countdown", "recording"]
 Judgement = Literal["success", "failure", "unmarked"]
@@ -54,6 +54,7 @@ class Drive(Message, frozen=True, kw_only=True):
 
     driver: Driver
     operator: Name = ""  # the person's name
+    policy: Name = ""  # name of the run that drives; empty for the one that did last
 
 
 class Engage(Message, frozen=True, kw_only=True):
@@ -279,6 +280,8 @@ class Status(Message, frozen=True, kw_only=True):
     resets: int
     driver: Driver
     operator: str
+    policy: str = ""  # the run that drives, or drove last
+    policy_late: int = 0  # ticks for which it had no word, since it took over
     phase: Phase
     countdown: float  # [s] left
     take_seconds: float

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import getpass
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -106,8 +105,13 @@ class Station:
         `provenance` goes into its header: which policy drove, and how.
         """
         self.twin.reset(seed, spread)
-        header = header_of(self.twin, agent=agent_name, operator=operator, has_images=self._has_images())
-        header = dataclasses.replace(header, provenance=provenance or {})
+        header = header_of(
+            self.twin,
+            agent=agent_name,
+            operator=operator,
+            has_images=self._has_images(),
+            provenance=provenance,
+        )
         meter = ForceMeter()
         with self._recorder.start(header, realtime=False) as take:
             ending = Session(self.twin).run(
@@ -131,7 +135,14 @@ class Station:
         return self._cameras is not None and self._cameras.error is None
 
 
-def header_of(twin: Twin, *, agent: str, operator: str | None, has_images: bool) -> Header:
+def header_of(
+    twin: Twin,
+    *,
+    agent: str,
+    operator: str | None,
+    has_images: bool,
+    provenance: Mapping[str, Any] | None = None,
+) -> Header:
     """The header of a take that begins now."""
     task = twin.task
     cameras = {view.name: (WIDTH, HEIGHT) for view in task.cameras} if has_images else {}
@@ -150,6 +161,7 @@ def header_of(twin: Twin, *, agent: str, operator: str | None, has_images: bool)
         world_from_base=tuple((*map(float, arm.base_position), 1.0, 0.0, 0.0, 0.0) for arm in task.arms),
         versions=versions(),
         control=_control_of(task, twin.config),
+        provenance=provenance or {},
     )
 
 

@@ -9,17 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blank import untrained
 from policies import SPEC, Riser
-from safetensors.torch import save
 from scipy.stats import binomtest
 
 from controller.model import ur5e
 from controller.types import Action, CartesianTarget, JointTarget, Observation
-from policy.act import Act
 from policy.agent import History, Inputs, Policy, load_policy
-from policy.checkpoint import MODEL, Checkpoint, write
-from policy.config import TrainConfig
-from policy.features import Encoding, Features, Scale
 from studio import references, tasks
 from studio.api import Studio
 from studio.evaluate import Plan
@@ -236,7 +232,7 @@ def test_a_policy_of_another_process_is_evaluated(tmp_path: Path, monkeypatch: p
 def test_a_run_is_evaluated_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also that what is hidden is hidden, and that a process of its own answers the same."""
     monkeypatch.setattr(wiping.Task, "time_limit", 1.0)
-    run = untrained(tmp_path / "runs" / "blank")
+    run = untrained(tmp_path / "runs" / "blank", "wiping")
     with Studio(tmp_path) as studio:
         plan = Plan.of("blank", None, (4,), tmp_path)
         found = studio.evaluate(dataclasses.replace(plan, hide=("wrench",)))
@@ -262,20 +258,6 @@ def test_a_run_is_evaluated_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     remote.close()
     with pytest.raises(RuntimeError, match="no checkpoint"):
         start(tmp_path)
-
-
-def untrained(run: Path) -> Path:
-    """A run whose network has learned nothing, and sees nothing but itself and forces."""
-    config = TrainConfig(width=16, feedforward=32, heads=2, images=False)
-    encoding = Encoding(1, "cartesian", config.frame, config.rotation, config.stiffness)
-    unit = [Scale(np.zeros(n), np.ones(n)) for n in (encoding.state_width, encoding.action_width, 6)]
-    spec = dataclasses.replace(SPEC, run=run.name, chunk=config.chunk, wrench_history=config.wrench_history)
-    checkpoint = Checkpoint(spec, config, Features(encoding, *unit), {}, "none")
-    tensors = {
-        name: tensor.contiguous() for name, tensor in Act.of(config, encoding, {}).state_dict().items()
-    }
-    write(run, checkpoint, {MODEL: save(tensors)}, is_best=True)
-    return run
 
 
 # References

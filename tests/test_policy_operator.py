@@ -7,16 +7,23 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
 
+import blank
 import msgspec
 import numpy as np
 import pytest
 import websockets.sync.client
 from agents import Listener
 from policies import SPEC, SPEED, Riser
+from test_live import Stage
 
 from controller.types import CartesianTarget, Hold, Image
 from policy.agent import ActionChunk, Inputs
+from studio import messages as m
+from studio.api import Studio
+from studio.episode import open_episode
 from studio.inputs.policy import Immediate, PolicyAgent, Thinking
 from studio.policy_link import PolicyServer, RemotePolicy, connect_to
 from studio.session import Session
@@ -110,6 +117,19 @@ def test_time_that_begins_anew_begins_a_new_run(twin: Twin) -> None:
     assert [type(target) for target in targets[:6]] == [Hold] * 5 + [CartesianTarget]
     height = listener.steps[0].observation.arms[0].base_from_tcp.position[2]
     assert targets[5].base_from_target.position[2] == pytest.approx(height, abs=0.005)
+
+
+def test_an_answer_to_somebody_before_is_dropped(twin: Twin) -> None:
+    twin.reset(3)
+    mind = Immediate(Riser(), latency=0.5)
+    session = Session(twin)
+    for ticks in (10, 100):  # the first is gone before its answer comes; it would move the arm back
+        agent = PolicyAgent(mind)
+        agent.reset(twin.observe())
+        mind.reset = lambda seed: None  # type: ignore[method-assign]
+        steps = [session.tick(agent) for _ in range(ticks)]
+    kinds = [type(step.requested.arms[0].target) for step in steps if step]
+    assert kinds == [Hold] * 50 + [CartesianTarget] * 50
 
 
 def test_images_of_before_the_reset_are_not_shown(twin: Twin) -> None:
@@ -233,3 +253,67 @@ def test_a_server_that_goes_is_told(inputs: Inputs) -> None:
     with pytest.raises(ConnectionError, match="hung up"):
         remote.predict(inputs)
     remote.close()
+
+
+# Live
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    blank.untrained(tmp_path / "runs" / "blank", "wiping")
+    blank.untrained(tmp_path / "runs" / "other", "drawing")
+    stage = Stage(tmp_path)
+    yield stage
+    stage.close()
+
+
+def test_a_person_takes_over_and_hands_back(stage: Stage) -> None:
+    with Studio(stage.data) as studio:
+        assert studio.runs_of("wiping") == ["blank"]
+    stage.link.send(m.Drive(driver="policy", operator="ana", policy="blank"))
+    stage.wait(lambda: stage.status.driver == "policy" and stage.status.policy == "blank")
+    start = stage.arm.base_from_target
+    # It wants the very pose that it sees; that its target has moved at all says that it was asked.
+    stage.wait(lambda: stage.arm.base_from_target != start, seconds=60)
+    stage.link.send(m.StartTake(countdown=0.0))
+    stage.wait(lambda: stage.status.take_seconds > 0.5)
+    assert not stage.status.arms[0].engaged
+    stage.move(0.0, 0.0, 0.02)
+    stage.wait(lambda: stage.status.driver == "operator" and stage.status.arms[0].engaged)
+    held = stage.arm.base_from_target
+    time.sleep(0.3)
+    assert stage.arm.base_from_target == pytest.approx(held, abs=1e-3)  # no answer of the policy moves it
+    stage.link.send(m.Drive(driver="policy", operator="ana"))
+    stage.wait(lambda: stage.status.driver == "policy", seconds=5)
+    seconds = stage.status.take_seconds
+    stage.wait(lambda: stage.status.take_seconds > seconds + 0.5)
+    assert stage.status.policy_late < 50  # its process was kept: it drives at once
+    stage.link.send(m.EndTake())
+    stage.wait(lambda: stage.heard("take kept"))
+    with open_episode(Path(stage.last_take().path)) as episode:
+        told = [event.text for event in episode.events() if event.kind == "driver"]
+        assert told == ["operator ana", "policy blank"]
+        assert episode.header.agent == "blank"
+        assert episode.header.provenance == {
+            "run": "blank",
+            "step": 7,
+            "execution": "replan",
+            "replan_every": 10,
+        }
+
+
+def test_a_policy_of_another_task_or_none_is_refused(stage: Stage) -> None:
+    for run, words in (("other", "learned 'drawing'"), ("nowhere", "No run 'nowhere'; there are")):
+        stage.notices.clear()
+        stage.link.send(m.Drive(driver="policy", policy=run))
+        stage.wait(lambda: stage.heard("error"))
+        assert words in stage.notices[-1].text
+        assert stage.status.driver == "nobody"
+
+
+def test_the_arms_hold_when_a_policy_dies(stage: Stage) -> None:
+    (stage.data / "runs" / "blank" / "checkpoints" / "last" / "model.safetensors").write_bytes(b"no tensors")
+    stage.link.send(m.Drive(driver="policy", policy="blank"))
+    stage.wait(lambda: stage.heard("error"), seconds=60)
+    assert "The arms hold." in stage.notices[-1].text
+    stage.wait(lambda: stage.status.driver == "nobody")

@@ -133,7 +133,12 @@ class PolicyAgent:
         self._history = History(mind.spec)
         self._executor = ChunkExecutor(execution, replan_every, n_arms=len(mind.spec.arms))
         self._time = 0.0  # [s] of the last observation
-        self._asked: float | None = None  # [s] when, where the answer is still out
+        self._asked: float | None = None  # [s] of the inputs to which the answer is still out
+
+    @property
+    def execution(self) -> dict[str, object]:
+        """How chunks are played."""
+        return {"execution": self._executor.mode, "replan_every": self._executor.replan_every}
 
     @property
     def late(self) -> int:
@@ -156,10 +161,9 @@ class PolicyAgent:
             inputs = self._history.inputs(observation)
             if inputs is not None and inputs.time <= now:  # else images of before the reset
                 self._mind.ask(inputs, now)
-                self._asked = now
+                self._asked = inputs.time
         chunk = self._mind.answer(now)
-        if chunk is not None:
+        if chunk is not None and chunk.time == self._asked:  # else the answer to somebody before us
             self._asked = None
-            if chunk.time <= now:
-                self._executor.add(chunk)
+            self._executor.add(chunk)
         return self._executor.action(now)

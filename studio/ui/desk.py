@@ -31,7 +31,7 @@ from studio.messages import (
 )
 from studio.ui.remote import Remote
 
-Choice = Literal["gizmo", "keyboard", "script", "nobody"]
+Choice = Literal["gizmo", "keyboard", "script", "policy", "nobody"]
 CHOICES: tuple[Choice, ...] = get_args(Choice)
 SIMULTANEOUS = 0.7  # [s] after a start within which a press cannot mean stop
 
@@ -46,13 +46,16 @@ class Desk:
         restore: Callable[[str], object],
         operator: Callable[[], str] = str,
         now: Callable[[], float] = time.monotonic,
+        runs_of: Callable[[str], list[str]] = lambda task: [],
     ) -> None:
         """`delete` moves the take of an id to the trash, `restore` brings it back.
 
-        `operator` tells the name of the person who drives.
+        `operator` tells the name of the person who drives, `runs_of` the runs that have learned a task.
         """
         self._remote, self._delete, self._restore = remote, delete, restore
         self._operator = operator
+        self.runs_of = runs_of
+        self.policy = ""  # the run that drives where the choice is "policy"
         self.countdown = 3.0  # [s] before recording
         self.with_sounds = True
         self.choice: Choice = "nobody"  # who was asked to drive last
@@ -91,6 +94,7 @@ class Desk:
             Drive(
                 driver="operator" if choice in ("gizmo", "keyboard") else choice,  # type: ignore[arg-type]
                 operator=self.operator,
+                policy=self.policy if choice == "policy" else "",
             )
         )
 
@@ -184,8 +188,8 @@ class Desk:
     def collect(self, count: int, seed: int) -> None:
         """Takes of consecutive seeds until `count` are kept."""
         status = self.status
-        if status and status.driver == "nobody" and self.choice in ("nobody", "script"):
-            self.drive("script" if self.choice == "script" else "gizmo")
+        if status and status.driver == "nobody" and self.choice in ("nobody", "script", "policy"):
+            self.drive("gizmo" if self.choice == "nobody" else self.choice)
         countdown = 0.0 if self.choice == "script" else self.countdown
         self._remote.post(Collect(count=count, seed=seed, countdown=countdown, operator=self.operator))
 

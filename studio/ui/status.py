@@ -133,6 +133,9 @@ def driver(status: Status, operator_input: OperatorInput, control: str = "") -> 
             return f"<b>{name or 'operator'}</b> drives by {operator_input}"
         case "script":
             return f"the <b>script</b> drives{has_control}"
+        case "policy":
+            late = f", late for {status.policy_late} ticks" if status.policy_late else ""
+            return f"<b>{escape(status.policy)}</b> drives{late}{has_control}"
         case other:
             assert_never(other)
 

@@ -19,8 +19,15 @@ from studio.ui.status import clock, mode_words
 
 ACTIVE: Final = "blue"
 PASSIVE: Final = "dark"
-LABELS: dict[Choice, str] = {"gizmo": "Gizmo", "keyboard": "Keys", "script": "Script", "nobody": "Nobody"}
+LABELS: dict[Choice, str] = {
+    "gizmo": "Gizmo",
+    "keyboard": "Keys",
+    "script": "Script",
+    "nobody": "Nobody",
+    "policy": "Policy",
+}
 MOST_TAKES = 1000
+LOOK_EVERY = 5.0  # [s] between looks for new runs
 SETTLE = 0.5  # [s] until what a person has set comes back from the session
 
 
@@ -92,7 +99,9 @@ class _DriverRows:
     def __init__(self, gui: viser.GuiApi, desk: Desk, keypad: Keypad) -> None:
         self._desk, self._keypad = desk, keypad
         _columns(gui, 4)
-        self._buttons = {choice: gui.add_button(LABELS[choice], color=PASSIVE) for choice in CHOICES}
+        people = [choice for choice in CHOICES if choice != "policy"]
+        self._buttons = {choice: gui.add_button(LABELS[choice], color=PASSIVE) for choice in people}
+        self._policies = _PolicyRow(gui, desk)
         self._hint = gui.add_html("")
         self._mirror = gui.add_button(
             "Mirror",
@@ -110,6 +119,7 @@ class _DriverRows:
         active = active_choice(status, self._desk.choice)
         for choice, button in self._buttons.items():
             _set_active(button, LABELS[choice], choice == active)
+        self._policies.show(status)
         self._keypad.show(status, visible=active == "keyboard")
         self._hint.content = f'<div class="text dim">{_DRIVER_HINTS[active]}</div>'
         self._mirror.visible = len(status.arms) == 2 and status.driver == "operator"
@@ -120,8 +130,41 @@ _DRIVER_HINTS: dict[Choice, str] = {
     "gizmo": "Drag the arrows at the tool; left alone it stays.",
     "keyboard": "Hold a key; directions follow your view.",
     "script": "The task's own demonstration runs.",
+    "policy": "The run drives. Drag the arrows at the tool to take over, press Policy to hand back.",
     "nobody": "The arms hold. Choosing who drives moves nothing.",
 }
+
+
+class _PolicyRow:
+    """The runs that have learned the task, and the button that lets one drive. Gone where there are none."""
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
+        self._desk, self._looked = desk, -LOOK_EVERY
+        self._task = ""
+        _columns(gui, 2)
+        self._run = gui.add_dropdown("Run", ("",), visible=False, hint="A trained policy of this task.")
+        self._button = gui.add_button(LABELS["policy"], color=PASSIVE, visible=False)
+
+        @self._run.on_update
+        def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+            desk.policy = self._run.value
+
+        on_click(self._button, partial(desk.drive, "policy"))
+
+    def show(self, status: Status) -> None:
+        now = time.monotonic()
+        if status.task != self._task or now > self._looked + LOOK_EVERY:
+            self._task, self._looked = status.task, now
+            self._offer(tuple(self._desk.runs_of(status.task)))
+        _set_active(self._button, LABELS["policy"], status.driver == "policy")
+
+    def _offer(self, runs: tuple[str, ...]) -> None:
+        self._run.visible = self._button.visible = bool(runs)
+        if runs and runs != self._run.options:
+            chosen = self._run.value
+            self._run.options = runs
+            set_value(self._run, chosen if chosen in runs else runs[0])
+        self._desk.policy = self._run.value if runs else ""
 
 
 class _ArmRows:
