@@ -18,6 +18,7 @@ MOMENTS = (0.05, 0.4, 0.6, 0.95)  # shares of the demonstration
 EVERY = 25  # ticks between two states that may be shown
 SIZE = (256, 192)  # [px] of one image; the policy sees it at WIDTH x HEIGHT
 CAPTION = 20  # [px] above it
+GAP = 4  # [px] between two columns
 JPEG_QUALITY = 85
 
 State = tuple[str, float, Array, Array | None]  # phase, time [s], joint positions, painted texture
@@ -57,7 +58,7 @@ def _demonstrate(task: str, seed: int) -> list[State]:
 
 
 def _column(process: CameraProcess, state: State) -> Array:
-    """(rows, width, 3) uint8: the images of one moment below each other."""
+    """(height, SIZE[0] + GAP, 3) uint8: the images of one moment below each other."""
     phase, time, qpos, texture = state
     images = process.render(time, qpos, texture)
     parts = []
@@ -67,7 +68,7 @@ def _column(process: CameraProcess, state: State) -> Array:
             _caption(f"{name}, {time:.0f} s: {phase}"),
             cv2.resize(image.pixels, SIZE, interpolation=cv2.INTER_AREA),
         ]
-    return np.vstack(parts)
+    return np.pad(np.vstack(parts), ((0, 0), (0, GAP), (0, 0)), constant_values=255)
 
 
 def _caption(text: str) -> Array:

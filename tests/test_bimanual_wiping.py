@@ -97,7 +97,7 @@ def test_the_demonstrator_lifts_wipes_and_puts_back_gently(twin: Twin, seed: int
     assert twin.progress().success
     assert phases == ["lift the hammer", "wipe", "put it back", "done"]
     assert force < 40.0
-    assert soft_depth < 0.0011
+    assert soft_depth < 0.001
     assert hard_depth < 0.0005
 
 

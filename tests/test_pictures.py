@@ -11,7 +11,7 @@ import pytest
 
 from studio import tasks
 from studio.doctor import render_backend
-from studio.pictures import CAPTION, MOMENTS, SIZE, write_picture
+from studio.pictures import CAPTION, GAP, MOMENTS, SIZE, write_picture
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -23,9 +23,10 @@ def test_a_picture_shows_every_camera_at_every_moment(tmp_path: Path) -> None:
     picture = cv2.imread(str(tmp_path / "new" / "wiping.jpg"))
     width, height = SIZE
     rows = np.split(picture, len(tasks.load("wiping").cameras))
-    assert picture.shape == (len(rows) * (height + CAPTION), len(MOMENTS) * width, 3)
+    assert picture.shape == (len(rows) * (height + CAPTION), len(MOMENTS) * (width + GAP), 3)
     for row in rows:
-        images = np.split(row[CAPTION:].astype(float), len(MOMENTS), axis=1)
+        columns = np.split(row[CAPTION:].astype(float), len(MOMENTS), axis=1)
+        images = [column[:, :width] for column in columns]
         assert min(image.std() for image in images) > 20.0  # of 255: not one colour
         assert np.abs(images[0] - images[2]).mean() > 2.0  # the arm has moved
 
