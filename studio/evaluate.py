@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from controller.types import ARM_ROW, Action, Array, CartesianTarget, Observation, Step
+from policy import checkpoint
 from policy.agent import ChunkExecutor, ExecutionMode, PolicySpec, load_policy, read_spec
 from studio import tasks
 from studio.evaluation import Curves, Evaluation, Rollout
@@ -90,7 +91,7 @@ class Plan:
                 with closing(connect_to(agent)) as policy:
                     spec = policy.spec
             else:
-                wanted = str(_folder_of(agent, data_dir))
+                wanted = str(_checkpoint_of(agent, data_dir))
                 spec = read_spec(Path(wanted))
         if task is None and spec is None:
             raise ValueError(f"Tell the task that {agent!r} shall do; there are {tasks.names()}.")
@@ -147,9 +148,10 @@ class Plan:
         return lambda twin: PolicyAgent(mind, self.execution, self.replan_every, seed=twin.seed)
 
 
-def _folder_of(agent: str, data_dir: Path) -> Path:
+def _checkpoint_of(agent: str, data_dir: Path) -> Path:
+    """The very checkpoint: training may go on meanwhile."""
     try:
-        return folder_of(agent, data_dir)
+        return checkpoint.find(folder_of(agent, data_dir))
     except KeyError as error:
         raise KeyError(f"{error.args[0]} References are {sorted(REFERENCES)}.") from None
 

@@ -64,6 +64,14 @@ class Evaluation:
     images: str = "no"  # "yes", "no", or why there are none although asked for
 
     @property
+    def label(self) -> str:
+        """The agent, and how it was run where that is not the usual way."""
+        extra = [f"{hidden} hidden" for hidden in self.provenance.get("hidden", ())]
+        if self.provenance.get("execution") == "ensemble":
+            extra.append("ensemble")
+        return f"{self.run} ({', '.join(extra)})" if extra else self.run
+
+    @property
     def judged(self) -> tuple[Rollout, ...]:
         """The rollouts without an error."""
         return tuple(rollout for rollout in self.rollouts if rollout.error is None)
@@ -105,7 +113,7 @@ class Evaluation:
         judged, (low, high) = self.judged, wilson(self.successes, len(self.judged))
         mean, sd = _pooled(judged)
         return (
-            f"{self.run} on {self.task}: {self.successes} of {len(judged)} succeeded "
+            f"{self.label} on {self.task}: {self.successes} of {len(judged)} succeeded "
             f"({low:.0%} to {high:.0%}), contact force {mean:.1f} ± {sd:.1f} N and at most "
             f"{max((r.force_max_N for r in judged), default=0.0):.1f} N, "
             f"{_mean(r.seconds for r in judged):.1f} s an episode; {self.evaluation_id}"
@@ -197,8 +205,8 @@ def compare(one: Evaluation, other: Evaluation) -> Comparison:
     only_one = sum(a.success and not b.success for a, b in pairs)
     only_other = sum(b.success and not a.success for a, b in pairs)
     return Comparison(
-        one=one.run,
-        other=other.run,
+        one=one.label,
+        other=other.label,
         task=one.task,
         pairs=len(pairs),
         only_one=only_one,
@@ -206,6 +214,23 @@ def compare(one: Evaluation, other: Evaluation) -> Comparison:
         difference=(only_one - only_other) / len(pairs),
         mcnemar_p=mcnemar(only_one, only_other),
         force_difference_N=_mean(a.force_mean_N - b.force_mean_N for a, b in pairs),
+    )
+
+
+def pooled(comparisons: Sequence[Comparison], one: str, other: str) -> Comparison:
+    """Several as one: the same question asked of several runs."""
+    pairs = sum(c.pairs for c in comparisons)
+    only_one, only_other = sum(c.only_one for c in comparisons), sum(c.only_other for c in comparisons)
+    return Comparison(
+        one=one,
+        other=other,
+        task=", ".join(dict.fromkeys(c.task for c in comparisons)),
+        pairs=pairs,
+        only_one=only_one,
+        only_other=only_other,
+        difference=(only_one - only_other) / pairs,
+        mcnemar_p=mcnemar(only_one, only_other),
+        force_difference_N=sum(c.force_difference_N * c.pairs for c in comparisons) / pairs,
     )
 
 

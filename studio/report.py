@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from controller.types import Array
 from studio.episode import Episode
-from studio.evaluation import Evaluation, Rollout, compare, wilson
+from studio.evaluation import Comparison, Evaluation, Rollout, compare, pooled, wilson
 from studio.tasks import drawing
 
 # Okabe and Ito's colours, told apart by everybody.
@@ -50,15 +50,6 @@ def write(evaluations: Sequence[Evaluation], open_episode: OpenEpisode, out: Pat
 # Tables
 
 
-def label(evaluation: Evaluation) -> str:
-    """The agent, and how it was run where that is not the usual way."""
-    told = evaluation.provenance
-    extra = [f"{hidden} hidden" for hidden in told.get("hidden", ())]
-    if told.get("execution") == "ensemble":
-        extra.append("ensemble")
-    return f"{evaluation.run} ({', '.join(extra)})" if extra else evaluation.run
-
-
 def table(evaluations: Sequence[Evaluation]) -> str:
     """One row each, as Markdown."""
     rows = [
@@ -82,7 +73,7 @@ def table(evaluations: Sequence[Evaluation]) -> str:
         rows.append(
             (
                 evaluation.task,
-                label(evaluation),
+                evaluation.label,
                 f"{told['successes']}/{told['episodes']}",
                 f"{low:.0%}–{high:.0%}",
                 f"{told['force_mean_N']:.1f} ± {told['force_sd_N']:.1f}",
@@ -97,18 +88,38 @@ def table(evaluations: Sequence[Evaluation]) -> str:
 
 
 def pairs(evaluations: Sequence[Evaluation]) -> list[str]:
-    """A sentence for every two that met the same scenes."""
-    told = []
-    for one, other in itertools.combinations(evaluations, 2):
-        if (one.task, one.spread) != (other.task, other.spread):
-            continue
-        if {r.seed for r in one.judged} & {r.seed for r in other.judged}:
-            told.append(str(compare(one, other)))
+    """A sentence for every two that met the same scenes, and for what hiding does to all runs together."""
+    met = [(*two, compare(*two)) for two in itertools.combinations(evaluations, 2) if _meet(*two)]
+    told = [str(comparison) for _, _, comparison in met]
+    blinded: dict[tuple[str, ...], list[Comparison]] = {}
+    for one, other, comparison in met:
+        if hidden := _only_blinded(one, other):
+            blinded.setdefault((one.task, *hidden), []).append(comparison)
+    for (_, *blind), same in blinded.items():
+        if len(same) > 1:
+            words = f"the same with {' and '.join(blind)} hidden"
+            told.append(str(pooled(same, f"{len(same)} runs that see and feel all", words)))
     return told
 
 
+def _meet(one: Evaluation, other: Evaluation) -> bool:
+    """Whether they share scenes."""
+    same = (one.task, one.spread) == (other.task, other.spread)
+    return same and bool({r.seed for r in one.judged} & {r.seed for r in other.judged})
+
+
+def _only_blinded(one: Evaluation, other: Evaluation) -> tuple[str, ...]:
+    """What is hidden in the second of two evaluations that are otherwise of the same policy."""
+    keys = ("run", "step", "execution", "replan_every")
+    if one.provenance.get("hidden") or [one.provenance.get(k) for k in keys] != [
+        other.provenance.get(k) for k in keys
+    ]:
+        return ()
+    return tuple(other.provenance.get("hidden", ()))
+
+
 def _text(evaluations: Sequence[Evaluation]) -> str:
-    sources = [f"- {label(e)} on {e.task}: {e.evaluation_id}, seeds {_seeds(e)}" for e in evaluations]
+    sources = [f"- {e.label} on {e.task}: {e.evaluation_id}, seeds {_seeds(e)}" for e in evaluations]
     paired = [f"- {sentence}" for sentence in pairs(evaluations)]
     parts = [
         "# Report",
@@ -139,7 +150,7 @@ def force_figure(evaluations: Sequence[Evaluation]) -> Figure:
             curves = evaluation.curves[arm]
             n = sum(trials >= len(evaluation.judged) / 2 for trials in curves.trials)
             time, mean, sd = np.array((curves.time_s, curves.force_mean_N, curves.force_sd_N))[:, :n]
-            panel.plot(time, mean, color=color, label=label(evaluation))
+            panel.plot(time, mean, color=color, label=evaluation.label)
             low = np.maximum(mean - sd, 0.0)
             panel.fill_between(time, low, mean + sd, color=color, alpha=0.2, linewidth=0)
         panel.set(ylabel=f"Force, {arm} arm [N]", xlim=(0, None), ylim=(0, None))
@@ -163,7 +174,7 @@ def stiffness_figure(evaluations: Sequence[Evaluation], open_episode: OpenEpisod
             _against(
                 panel, {k.removeprefix(f"{arm}/"): c for k, c in columns.items() if k.startswith(f"{arm}/")}
             )
-            panel.set_title(f"{label(evaluation)}, seed {rollout.seed}, {arm} arm", fontsize="small")
+            panel.set_title(f"{evaluation.label}, seed {rollout.seed}, {arm} arm", fontsize="small")
     for panel in panels[-len(arms) :]:
         panel.set_xlabel("Time [s]")
     return figure
@@ -181,7 +192,7 @@ def drawings_figure(evaluations: Sequence[Evaluation], open_episode: OpenEpisode
         if grids:
             alike = [drawing.likeness(grid) for grid in grids]
             words = f"SSIM {np.mean(alike):.3f} ± {np.std(alike):.3f}, n = {len(grids)}"
-            _show(panel, np.mean(grids, axis=0), f"{label(evaluation)}\n{words}")
+            _show(panel, np.mean(grids, axis=0), f"{evaluation.label}\n{words}")
     return figure
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import cv2
@@ -69,13 +68,28 @@ def test_stiffness_is_low_where_the_demonstrator_presses(drawn: tuple[Path, list
 
 def test_what_was_hidden_is_told(drawn: tuple[Path, list[Evaluation]]) -> None:
     seen = drawn[1][0]
+    assert seen.label == "demonstrator"
     told = {"run": "wipe-1", "execution": "ensemble", "hidden": ["images"]}
-    assert report.label(seen) == "demonstrator"
     hidden = dataclasses.replace(seen, run="wipe-1", provenance=told)
-    assert report.label(hidden) == "wipe-1 (images hidden, ensemble)"
+    assert hidden.label == "wipe-1 (images hidden, ensemble)"
     other_task = dataclasses.replace(seen, task="wiping")
     assert len(report.pairs([seen, hidden, other_task])) == 1
-    json.dumps(seen.summary())
+
+
+def test_hiding_is_judged_over_all_runs(drawn: tuple[Path, list[Evaluation]]) -> None:
+    """Each run sees in all of four scenes and fails blind: p = 1/8 each, 1/128 together."""
+    (rollout,) = drawn[1][0].rollouts
+    evaluations = []
+    for run in ("one", "two"):
+        for hidden in ([], ["objects"]):
+            rollouts = tuple(dataclasses.replace(rollout, seed=n, success=not hidden) for n in range(4))
+            told = {"run": run, "step": 9, "execution": "replan", "replan_every": 10, "hidden": hidden}
+            evaluations.append(dataclasses.replace(drawn[1][0], run=run, provenance=told, rollouts=rollouts))
+    sentences = report.pairs(evaluations)
+    assert len(sentences) == 6 + 1
+    assert sum("p = 0.12)" in sentence for sentence in sentences) >= 2
+    assert sentences[-1].startswith("2 runs that see and feel all against the same with objects hidden on 8")
+    assert "(8 : 0 where only one succeeded, exact McNemar p = 0.0078)" in sentences[-1]
 
 
 def test_a_report_of_nothing_is_refused(tmp_path: Path) -> None:
