@@ -1,4 +1,4 @@
-"""What `studio serve` runs: session process, viser with the page, front server. It ends them in order.
+"""What `studio serve` runs: the session process, and `studio.site` with the page. It ends them in order.
 
 DATA/.serve.lock        held while a server runs on the folder; its pid and URL for the next one who tries
 DATA/logs/session.log   what the session process says
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import getpass
 import json
 import logging
 import os
@@ -22,26 +21,16 @@ import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
-
-import rich
+from typing import IO, TYPE_CHECKING
 
 from controller.stiffness import StiffnessTable
-from studio import cert, invitation, tasks
-from studio.api import Studio
-from studio.cert import Certificate
-from studio.door import person_of
-from studio.headset import add_xr
+from studio import tasks
 from studio.link import socket_path
 from studio.messages import Shutdown
-from studio.proxy import LOOPBACK
-from studio.server import PORT, FrontServer, is_loopback, make_app, start_viser
-from studio.ui.app import Page
-from studio.ui.gate import Gate
 from studio.ui.remote import Remote
 
 if TYPE_CHECKING:
-    import viser
+    from studio.cert import Certificate
 
 LOCK = ".serve.lock"
 START_TIMEOUT = 60.0  # [s] for a session process to answer on a busy machine
@@ -135,8 +124,8 @@ class SessionProcess:
 
 def serve(
     data_dir: Path,
-    host: str = LOOPBACK,
-    port: int = PORT,
+    host: str = "127.0.0.1",
+    port: int = 8080,
     task: str = "wiping",
     *,
     cameras: bool = True,
@@ -160,84 +149,37 @@ def serve(
     ended = _on_signals()
     with contextlib.ExitStack() as stack:
         lock = stack.enter_context(_lock(data_dir))
-        studio = stack.enter_context(Studio(data_dir))
-        for recovery in studio.recover():
-            tell(recovery.what)
         process = SessionProcess(data_dir, task, cameras=cameras, stiffness_table=stiffness_table)
-        is_local = is_loopback(host)
-        if not is_local and certificate is None and tls:
-            certificate = cert.of_installation(invitation.folder())
-        token = None if is_local else invitation.token(renew=new_token)
-        gate = Gate(_user() if is_local else "")
-        viewer = start_viser(arrive=gate.arrive)
-        stack.callback(_stop, viewer)
-        page = Page(viewer, studio, process, gate, (lambda: front.invitation) if token else None)
-        stack.callback(page.close)
-        app = make_app(
-            viewer.get_port(),
-            health=lambda: health(page.remote, process, len(viewer.get_clients())),
-            reception=gate.receive,
-        )
-        add_xr(app, page.remote, lambda socket: gate.lease.sit(person_of(socket), "headset"), page.model)
-        front = FrontServer(app, host, port, token=token, certificate=certificate)
-        stack.enter_context(front)
-        _write(lock, front.url)
-        page.start()
         if pid := process.find():
             tell(f"A session process is running already (process {pid}); the page joins it.")
         else:
             process.start()
-        stack.callback(_end_session, page.remote, process)
-        process.connect(page.remote)
-        tell(f"Comp-ACT Studio serves {data_dir} at {front.url}")
-        if token:
-            tell(_invite(front.invitation, certificate))
+            stack.callback(process.end)  # where the page does not come to be
+        from studio.site import open_site  # takes seconds, in which the session process starts, too
+
+        site = stack.enter_context(
+            open_site(
+                data_dir,
+                process,
+                host,
+                port,
+                certificate=certificate,
+                tls=tls,
+                new_token=new_token,
+                tell=tell,
+            )
+        )
+        _write(lock, site.front.url)
+        site.page.start()
+        stack.callback(_end_session, site.page.remote, process)
+        process.connect(site.page.remote)
+        tell(f"Comp-ACT Studio serves {data_dir} at {site.front.url}")
+        if site.invitation:
+            tell(site.invitation)
         if open_page:
-            webbrowser.open(front.url)
+            webbrowser.open(site.front.url)
         ended.wait()
         tell("Ending. A running take is kept.")
-
-
-def _invite(link: str, certificate: Certificate | None) -> str:
-    """What the terminal tells once: the link, and how to know that it leads here."""
-    lines = [invitation.qr_text(link)] if sys.stdout.isatty() else []
-    lines += [f"Others come in by this link; who has it may ask for control:\n  {link}"]
-    if certificate is None:
-        lines += ["Without TLS whoever shares the network can read it, and headsets show no VR."]
-    else:
-        facts = cert.read(certificate)
-        lines += [f"Their browsers warn once of a certificate with the fingerprint\n  {facts.fingerprint}"]
-    return "\n".join(lines)
-
-
-def _user() -> str:
-    """Who is logged in, unless that says nothing."""
-    user = getpass.getuser()
-    return "" if user == "root" else user
-
-
-def health(remote: Remote, process: SessionProcess, n_viewers: int) -> dict[str, Any]:
-    """What /api/v1/health tells beside the server's own."""
-    status, _ = remote.status.get()
-    is_alive = remote.state == "open"
-    return {
-        "session": remote.state,
-        "session_pid": process.pid if is_alive else None,
-        "task": status.task if status else None,
-        "phase": status.phase if status and is_alive else None,
-        "take": status.take_id or None if status and is_alive else None,
-        "cameras": (status.camera_error or "ok") if status and is_alive else None,
-        "viewers": n_viewers,
-    }
-
-
-def _stop(viewer: viser.ViserServer) -> None:
-    console = rich.get_console()
-    quiet, console.quiet = console.quiet, True  # what it says is not for people
-    try:
-        viewer.stop()
-    finally:
-        console.quiet = quiet
 
 
 def _end_session(remote: Remote, process: SessionProcess) -> None:

@@ -22,7 +22,7 @@ FORBIDDEN = {
 ONLY_IN = {
     "torch": ("policy/",),
     "mcap": ("studio/mcap_file.py", "studio/recovery.py"),
-    "viser": ("studio/ui/", "studio/server.py"),
+    "viser": ("studio/ui/", "studio/server.py", "studio/site.py"),
     "rerun": ("studio/export/rrd.py",),
     "openvr": ("studio/inputs/steamvr.py",),
     "ray": ("studio/jobs.py",),
@@ -38,7 +38,7 @@ LAYERS = (
     ("twin", "cameras", "inputs"),
     ("recorder", "catalog", "replay", "training", "evaluate", "jobs", "export"),
     ("api",),
-    ("server", "headset", "ui", "serve", "__main__"),
+    ("server", "site", "headset", "ui", "serve", "__main__"),
 )
 SKINS = len(LAYERS) - 1
 

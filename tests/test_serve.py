@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 from served import Site, start_take
-from visitor import wait_for
+from visitor import Visitor, wait_for
 
 from studio.api import Studio
+from studio.link import socket_path
+from studio.messages import Status
 from studio.serve import LOCK, SessionProcess
 from studio.server import start_viser
 from studio.ui.app import Page
@@ -106,6 +110,70 @@ def test_a_session_killed_while_recording_is_restarted_and_its_take_recovered(si
     viewer.stop()
     process.end()
     assert process.find() is None
+
+
+LINK = re.compile(r"http://\S+:(\d+)/\?token=(\S+)")
+
+
+def cookie(port: str, token: str) -> dict[str, str]:
+    """Of a browser that has opened the link."""
+    answer = httpx.get(f"http://127.0.0.1:{port}/", params={"token": token})
+    return {"Cookie": answer.headers["Set-Cookie"].partition(";")[0]}
+
+
+def test_others_come_in_by_the_link_and_only_one_of_them_moves_the_arm(
+    site: Site, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
+    served = site.serve("--host", "0.0.0.0", "--no-tls")
+    assert served.process.stdout is not None
+    while not (link := LINK.search("".join(served.said))):
+        served.said.append(served.process.stdout.readline())
+        assert served.said[-1], served.process.communicate()
+    port, token = link.groups()
+    assert httpx.get(f"http://127.0.0.1:{port}/api/v1/health").status_code == 401
+
+    remote = Remote()
+    remote.connect(socket_path(site.data))
+
+    def status() -> Status:
+        found, _ = remote.status.get()
+        assert found is not None
+        return found
+
+    def target() -> tuple[float, ...]:
+        frame, _ = remote.frame.get()
+        assert frame is not None
+        return frame.arms[0].base_from_target
+
+    ben = Visitor(int(port), headers=cookie(port, token))
+    with Visitor(int(port), headers=cookie(port, token)) as ana:
+        ana.click("Gizmo")
+        wait_for(lambda: status().driver == "operator" and status().arms[0].engaged)
+        before = target()
+        ben.click("Next seed")
+        ben.click("Nobody")
+        drag = {"type": "TransformControlsUpdateMessage", "name": "/live/gizmo/right"}
+        ben.send(drag | {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.4, 0.1, 0.3)})
+        wait_for(lambda: any(title == "You are watching" for title, _ in ben.notifications))
+        ana.send(drag | {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.4, 0.1, float("nan"))})
+        wait_for(lambda: status().driver == "nobody")  # thrown out: the arms hold
+        assert (target(), status().seed) == (before, 0)
+    wait_for(lambda: ben.says("nobody drives, the arms hold"))
+    ben.click("Gizmo")
+    wait_for(lambda: status().driver == "operator")
+    ben.__exit__()
+    wait_for(lambda: status().driver == "nobody", seconds=3.0)
+    assert target() == before
+    remote.close()
+
+    served.process.send_signal(signal.SIGTERM)
+    said, complained = served.process.communicate(timeout=30)
+    assert ("".join(served.said) + said).count(token) == 1
+    assert token not in complained
+    files = [path for path in site.data.rglob("*") if path.is_file()]
+    assert any(path.suffix == ".log" for path in files)
+    assert not [path for path in files if token.encode() in path.read_bytes()]
 
 
 def test_a_session_that_does_not_answer_is_killed_at_the_end(site: Site) -> None:

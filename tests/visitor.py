@@ -32,13 +32,14 @@ CAMERA = {  # only who tells where the camera is counts as a client; this one lo
 class Visitor:
     """Use it with `with`."""
 
-    def __init__(self, port: int, query: str = "") -> None:
+    def __init__(self, port: int, query: str = "", headers: dict[str, str] | None = None) -> None:
         self.widgets: dict[str, dict[str, Any]] = {}  # properties, by uuid
         self.commands: dict[str, str] = {}  # uuid of each command, by label
         self.notifications: list[tuple[str, str]] = []  # title, text
         self.bytes = 0
         self._socket = connect(
             f"ws://127.0.0.1:{port}/{query}",
+            additional_headers=headers,
             subprotocols=[Subprotocol(f"viser-v{version('viser')}")],
             compression=None,
             max_size=None,

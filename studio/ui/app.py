@@ -50,6 +50,8 @@ log = logging.getLogger(__name__)
 class SessionProcess(Protocol):
     """Whoever can start the session process of the data folder."""
 
+    pid: int | None  # of the one that answered last
+
     def connect(self, remote: Remote, timeout: float) -> None:
         """Raises TimeoutError or RuntimeError where no session answers."""
 
