@@ -19,6 +19,7 @@ PARTS = (
     "episodes",
     "live",
     "gizmo",
+    "xr",
     "scene",
     "proxy",
     "review",
@@ -113,4 +114,10 @@ GOALS = (
         "<=",
         40.0,
     ),
+    Goal("xr", "hand to servo at 60 Hz, p50 [ms]", lambda r: r["p50_ms"], "<=", 12.0),
+    Goal("xr", "hand to servo at 60 Hz, p95 [ms]", lambda r: r["p95_ms"], "<=", 25.0),
+    Goal("xr", "the same while others download, p50 [ms]", lambda r: r["with_downloads_p50_ms"], "<=", 12.0),
+    Goal("xr", "the same while others download, p95 [ms]", lambda r: r["with_downloads_p95_ms"], "<=", 25.0),
+    Goal("xr", "poses that arrived, share", lambda r: r["arrived"], ">=", 0.99),
+    Goal("xr", "two hands at 120 Hz, share of a core", lambda r: r["two_hands_share_of_core"], "<=", 0.06),
 )

@@ -7,11 +7,11 @@ turns as the hand turns, both since the moment of engagement, so that engaging m
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from controller.types import Array, Pose, multiply_quaternions, rotation_vector
+from controller.types import Pose, multiply_quaternions
 
 # Between two samples a tracked hand goes no further than this, nor faster; more is a tracking error.
 MAX_JUMP = 0.06  # [m]
@@ -73,7 +73,7 @@ class _Grip:
         turn = multiply_quaternions(hand.wxyz, self.hand.wxyz * CONJUGATE)
         wxyz = multiply_quaternions(turn, self.target.wxyz)
         position = self.target.position + self.scale * (hand.position - self.hand.position)
-        return Pose(position, wxyz / np.linalg.norm(wxyz))
+        return Pose(position, wxyz / math.sqrt(float(wxyz @ wxyz)))
 
 
 class Fader:
@@ -117,17 +117,14 @@ def seen_from(pose: Pose, yaw: float) -> Pose:
     x, y, z = pose.position.tolist()
     back = np.array([math.cos(yaw / 2), 0.0, 0.0, -math.sin(yaw / 2)])
     wxyz = multiply_quaternions(back, pose.wxyz)
-    return replace(pose, position=np.array([c * x + s * y, c * y - s * x, z]), wxyz=wxyz)
+    return Pose(np.array([c * x + s * y, c * y - s * x, z]), wxyz)
 
 
 def _jump(before: Pose, now: Pose, dt: float) -> str:
     """What is wrong with going from one sample to the next in `dt` [s]; empty where nothing is."""
-    way = float(np.linalg.norm(now.position - before.position))
-    turn = _angle(before.wxyz, now.wxyz)
+    moved = now.position - before.position
+    way = math.sqrt(float(moved @ moved))
+    turn = 2.0 * math.acos(min(1.0, abs(float(before.wxyz @ now.wxyz))))
     if way <= max(MAX_JUMP, MAX_SPEED * dt) and turn <= max(MAX_TURN, MAX_TURN_RATE * dt):
         return ""  # NaN gets no further
     return f"The controller's pose jumped by {way * 100:.0f} cm and {math.degrees(turn):.0f}°."
-
-
-def _angle(a: Array, b: Array) -> float:
-    return float(np.linalg.norm(rotation_vector(multiply_quaternions(b, a * CONJUGATE))))
