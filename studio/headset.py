@@ -212,8 +212,19 @@ class _Headset:
                     self._seat.post(self._hands)
             self._seat.post(command)
         except NotDriving as error:
-            if not isinstance(command, m.Hands | m.LoseHand):
+            if isinstance(command, m.Clutch):
+                self._ask()
+            elif not isinstance(command, m.Hands | m.LoseHand):
                 self._say(str(error))
+
+    def _ask(self) -> None:
+        """Who closes the clutch wants to drive, and has no other button for saying so."""
+        try:
+            self._seat.ask()
+        except NotDriving as error:
+            self._say(str(error))
+        else:
+            self._say(f"{self._seat.standing.holder} has control; you asked for it.")
 
     def _say(self, text: str) -> None:
         self._said, self._said_at = text, time.monotonic()

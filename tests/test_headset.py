@@ -193,7 +193,7 @@ def test_only_who_drives_is_obeyed(site: Site) -> None:
         wait_for(site.is_engaged)
         before = site.target(0)
         ben.press("left", 5)
-        wait_for(lambda: "has control" in ben.state["said"])
+        wait_for(lambda: "you asked for it" in ben.state["said"])
         ben.move("left", 0.0, 0.1, 0.0)
         assert not site.is_engaged(0)
         assert np.abs(site.target(0) - before).max() < 1e-9
