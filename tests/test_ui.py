@@ -21,11 +21,12 @@ from controller.types import Pose, StiffnessMode, quaternion_from_rotation_vecto
 from studio import messages as m
 from studio import tasks
 from studio.api import Studio
+from studio.lease import Standing
 from studio.link import Hub, socket_path
 from studio.server import FrontServer, make_app, start_viser
 from studio.tasks import ArmSetup
+from studio.ui import control, viser_private
 from studio.ui import status as words
-from studio.ui import viser_private
 from studio.ui.app import Page
 from studio.ui.desk import Desk
 from studio.ui.first_steps import FirstSteps
@@ -34,7 +35,7 @@ from studio.ui.gizmo import SETTLED, Gizmo
 from studio.ui.keys import Hotkeys, Keypad, world_from_view
 from studio.ui.plots import MAX_FORCE, gauge
 from studio.ui.remote import SILENCE, Remote
-from studio.ui.system import facts
+from studio.ui.system import facts, invitation_html
 from studio.ui.teleop import TeleopTab
 
 HOME = (0.36, 0.0, 0.2, 0.0, 0.7071067811865476, -0.7071067811865476, 0.0)
@@ -391,7 +392,11 @@ def test_what_people_typed_never_becomes_markup() -> None:
         words.line(status, "open", "gizmo"),
         words.over(status, "open"),
         words.over(status, "closed"),
+        words.line(status, "open", "gizmo", control=bad),
         facts(status, "open", 1, Path("/data") / bad, 1e9),
+        invitation_html(f"https://host/?token={bad}"),
+        gauge(bad, 1.0, 1.0, "ok"),
+        *(control.words(Standing(bad, mine, bad, False, 2)) for mine in (True, False)),
     ]
     assert not any("<img" in html for html in shown)
 
@@ -488,6 +493,28 @@ def test_a_second_arm_has_rows_and_keys_of_its_own(gui: viser.ViserServer) -> No
         ana.button("Low 250 N/m")
         tab.set_task(arms[1:])
         wait_for(lambda: ana._find("GuiButtonMessage", "High") is None)
+
+
+def test_runs_of_the_task_are_offered_and_one_is_asked_to_drive(gui: viser.ViserServer) -> None:
+    remote, asked = Remote(), []
+    remote.post = asked.append  # type: ignore[method-assign, assignment]
+    runs = {"wiping": ["wipe-2", "wipe-1"], "drawing": []}
+    desk = Desk(remote, lambda _: None, lambda _: None, runs_of=runs.__getitem__)
+    tab = TeleopTab(gui.gui, desk, Keypad(desk, lambda _: None))
+    with Visitor(gui.get_port()) as ana:
+        assert ana._find("GuiButtonMessage", "Policy") is None
+        tab.show(msgspec.structs.replace(STATUS, task="wiping"))
+        choice = wait_for(lambda: ana._find("GuiDropdownMessage", "Run"))
+        ana.send({"type": "GuiUpdateMessage", "uuid": choice["uuid"], "updates": {"value": "wipe-1"}})
+        wait_for(lambda: desk.policy == "wipe-1")
+        ana.click("Policy")
+        wait_for(lambda: asked)
+        assert asked == [m.Drive(driver="policy", operator="", policy="wipe-1")]
+        tab.show(msgspec.structs.replace(STATUS, task="wiping", driver="policy", policy="wipe-1"))
+        ana.button("● Policy")
+        assert desk.policy == "wipe-1"
+        tab.show(msgspec.structs.replace(STATUS, task="drawing"))
+        assert desk.policy == ""
 
 
 def test_the_first_steps_are_ticked_off_and_go(gui: viser.ViserServer) -> None:
