@@ -29,14 +29,18 @@ ONLY_IN = {
     "h5py": ("studio/export/act_hdf5.py",),
     "av": ("studio/export/lerobot.py",),
     "sqlite3": ("studio/index.py",),
+    "matplotlib": ("studio/report.py",),
 }
 
 # Inside studio, lowest first: a file imports nothing of a layer above its own.
 LAYERS = (
     ("channels", "schema", "edits", "index", "doctor"),
     ("episode", "episode_writer", "recovery", "tasks", "session"),
-    ("twin", "cameras", "inputs"),
-    ("recorder", "catalog", "replay", "training", "evaluate", "jobs", "export"),
+    ("twin", "cameras", "inputs", "policy_link"),
+    (
+        *("recorder", "catalog", "replay", "training", "jobs", "export", "pilot"),
+        *("references", "evaluation", "evaluate", "report", "probes"),
+    ),
     ("api",),
     ("server", "site", "headset", "ui", "serve", "__main__"),
 )
