@@ -645,7 +645,7 @@ def make_certificate(names: tuple[str, ...] = (), json: Json = False) -> int:
 def steamvr(
     data: Data = DATA,
     scale: float = 1.0,
-    view: float = 0.0,
+    view: float | None = None,
     grip_as_clutch: bool = False,
     one_arm: Literal["left", "right"] = "right",
     dead_band: float = 3.0,
@@ -658,7 +658,8 @@ def steamvr(
 
     Args:
         scale: An arm's way to the hand's; rotations are never scaled.
-        view: Degrees by which you stand turned from the robot: 0 behind it, 180 facing it.
+        view: Degrees by which you stand turned from the robot: 0 behind it, 90 on its right, 180 facing it;
+            by default behind two arms and to the right of one.
         grip_as_clutch: An arm follows while the grip is held; the menu button switches stiffness.
         one_arm: The hand that leads where there is one arm.
         dead_band: Contact force in newtons from which on it vibrates.
@@ -676,7 +677,7 @@ def steamvr(
         mapping=GRIP_AS_CLUTCH if grip_as_clutch else PAPER,
         haptics=Haptics(dead_band, full, strength),
         scale=scale,
-        view=math.radians(view),
+        view=None if view is None else math.radians(view),
         one_arm=one_arm,
         countdown=countdown,
         operator=operator,

@@ -296,7 +296,7 @@ class _Headset:
         low = np.min([setup.workspace[0] for setup in setups], axis=0)
         high = np.max([setup.workspace[1] for setup in setups], axis=0)
         turn = Pose(np.zeros(3), quaternion_from_rotation_vector(np.array([0.0, 0.0, yaw])))
-        facing = yaw + self._controllers.settings.view
+        facing = yaw + self._controllers.view
         ahead = np.array([math.cos(facing), math.sin(facing), 0.0])
         middle = self._head.position + STAND_OFF * ahead - np.array([0.0, 0.0, BELOW_EYES])
         return xr.stage_of(Pose(middle - turn.apply((low + high) / 2), turn.wxyz))

@@ -66,7 +66,7 @@ class Player:
     def __init__(self, settings: Settings | None = None, status: m.Status = STATUS) -> None:
         self.sent: list[m.Command] = []
         self.status, self.time = status, 0.0
-        self.controllers = Controllers(self.sent.append, settings)
+        self.controllers = Controllers(self.sent.append, settings or Settings(view=0.0))
         self.show()
 
     def show(self, *sides: Side, head: Pose = HEAD, **buttons: float) -> list[m.Command]:
@@ -159,6 +159,9 @@ def test_ahead_is_where_the_operator_faces_and_facing_anew_lets_go() -> None:
     player = Player(Settings(view=math.pi))  # facing the robot
     player.show()
     assert player.samples[0].position == pytest.approx((-ahead[0], -ahead[1], ahead[2]))
+    player = Player(Settings())  # to the right of one arm
+    player.show()
+    assert player.samples[0].position == pytest.approx((-ahead[1], ahead[0], ahead[2]))
 
 
 # WebXR

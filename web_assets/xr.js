@@ -56,7 +56,7 @@ function settings() {
   for (const field of form.elements) {
     if (!field.name) continue;
     if (field.type === "checkbox") values[field.name] = field.checked;
-    else values[field.name] = field.type === "range" || field.name === "view" ? Number(field.value) : field.value;
+    else values[field.name] = field.type === "range" || (field.name === "view" && field.value) ? Number(field.value) : field.value;
   }
   return values;
 }
@@ -81,7 +81,7 @@ function tell() {
     mapping[name] = given[name] || null;
     delete given[name];
   }
-  channel.say({ type: "settings", mapping, ...given });
+  channel.say({ type: "settings", mapping, ...given, view: given.view === "" ? null : given.view });
   headset?.watch(twin, images);
 }
 

@@ -8,6 +8,7 @@ switches between the task's two stiffness modes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from collections.abc import Mapping as Dict
 from dataclasses import dataclass, field, fields
@@ -68,7 +69,9 @@ class Settings:
     mapping: Mapping = PAPER
     haptics: Haptics = field(default_factory=Haptics)
     scale: float = 1.0  # of an arm's way to the hand's
-    view: float = 0.0  # [rad] about z by which I stand turned from the robot: 0 behind it, pi facing it
+    # [rad] about z by which I stand turned from the robot: 0 behind it, pi facing it. None is where the page
+    # looks from: behind two arms, to the right of one, whose shoulder would hide the work.
+    view: float | None = None
     one_arm: Side = "right"  # the hand that leads where there is one arm
     countdown: float = 3.0  # [s] before recording
     operator: str = ""  # the person's name
@@ -108,7 +111,14 @@ class Controllers:
     @property
     def yaw(self) -> float | None:
         """[rad] about z from the room's x to the robot's; None until the head was seen."""
-        return None if self._yaw is None else self._yaw - self.settings.view
+        return None if self._yaw is None else self._yaw - self.view
+
+    @property
+    def view(self) -> float:
+        """[rad] about z by which the operator stands turned from the robot."""
+        if self.settings.view is not None:
+            return self.settings.view
+        return math.pi / 2 if len(self._arms) == 1 else 0.0
 
     def update(
         self, hands: Dict[Side, Controller], head: Pose | None, moment: Moment, status: Status | None
@@ -147,7 +157,7 @@ class Controllers:
         for side, controller in hands.items():
             if (arm := self._arm(side)) is None:
                 continue
-            pose = seen_from(controller.pose, self.yaw or 0.0)
+            pose = seen_from(controller.pose, (self._yaw or 0.0) - self.view)
             button = self.settings.mapping.gripper
             samples.append(
                 HandSample(

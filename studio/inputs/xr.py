@@ -90,7 +90,7 @@ class XrSettings(msgspec.Struct, tag="settings", forbid_unknown_fields=True):
     full: float
     strength: float
     scale: float
-    view: Annotated[float, Meta(ge=-360.0, le=360.0)]  # [deg]
+    view: Annotated[float, Meta(ge=-360.0, le=360.0)] | None  # [deg]
     one_arm: Side
     countdown: Annotated[float, Meta(ge=0.0, le=60.0)]
     operator: Name = ""
@@ -101,7 +101,7 @@ class XrSettings(msgspec.Struct, tag="settings", forbid_unknown_fields=True):
             mapping=msgspec.convert(self.mapping, Mapping),
             haptics=Haptics(self.dead_band, self.full, self.strength),
             scale=self.scale,
-            view=math.radians(self.view),
+            view=None if self.view is None else math.radians(self.view),
             one_arm=self.one_arm,
             countdown=self.countdown,
             operator=self.operator,
