@@ -230,6 +230,7 @@ class _Headset:
         self._said, self._said_at = text, time.monotonic()
 
     async def _tell(self) -> None:
+        due = time.monotonic()
         while True:
             notice, heard = self._remote.newest_notice.get()
             if notice and heard != self._heard and notice.kind in ("error", "warning"):
@@ -242,7 +243,8 @@ class _Headset:
                     await self._view.send_twin(self._socket, self._remote, status, frame)
                 if self._watch.images:
                     await self._view.send_images(self._socket, self._remote, status)
-            await asyncio.sleep(PERIOD)
+            due = max(due + PERIOD, time.monotonic())
+            await asyncio.sleep(due - time.monotonic())
 
     def _state(self, status: m.Status, frame: m.Frame) -> str:
         now = time.monotonic()
