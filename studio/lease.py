@@ -141,11 +141,13 @@ class Lease:
         with self._lock:
             if self._holder is None:
                 self._pass_to(seat.person, "")
-            elif seat.person != self._holder:
-                if self._asker not in (None, seat.person):
+            elif seat.person not in (self._holder, self._asker):
+                if self._asker is not None:
                     raise NotDriving(f"{self._words(self._asker)} has asked already.")
                 self._asker, self._acted = seat.person, self._now()
                 self._call_later(PATIENCE, self.settle)
+                words = f"{self._words(seat.person)} asks {self._words(self._holder)} for control."
+                self._tell(Notice(kind="info", text=words))
 
     def _answer(self, seat: Seat, yes: bool) -> None:
         with self._lock:

@@ -258,3 +258,23 @@ def test_references_are_one_table(studio: Run, tmp_path: Path, monkeypatch: pyte
     told = last_json(studio(*report)[1])
     assert [evaluation["run"] for evaluation in told["evaluations"]] == ["demonstrator", "all-high"]
     assert {Path(path).name for path in told["files"]} == {path.name for path in (tmp_path / "out").iterdir()}
+
+
+def test_a_certificate_is_made_for_this_machine_and_further_names(
+    studio: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    status, text, _ = studio("cert", "--names", "studio.lab.example", "192.0.2.7", "--json")
+    told = json.loads(text)
+    assert status == 0
+    assert {"studio.lab.example", "192.0.2.7", "localhost", "127.0.0.1"} <= set(told["names"])
+    assert Path(told["key"]).stat().st_mode & 0o777 == 0o600
+    status, text, _ = studio("cert")
+    assert told["fingerprint"] not in text  # another key
+    status, _, complaint = studio("serve", "--data", tmp_path / "data", "--cert", told["cert"])
+    assert (status, "--cert and --key belong together" in complaint) == (2, True)
+    status, _, complaint = studio(
+        "serve", "--data", tmp_path / "data", "--cert", told["key"], "--key", told["cert"]
+    )
+    assert (status, "hold no certificate" in complaint) == (2, True)
+    assert not (tmp_path / "data").exists()

@@ -140,7 +140,10 @@ def test_it_is_handed_over_to_who_asked_and_the_arms_hold(room: Room) -> None:
     ana.give_up()
     assert ben.may_drive
     assert room.posted == [ENGAGE, m.OperatorLeft()]
-    assert room.told == ["Ana gave up control; the arms hold. Ben has control."]
+    assert room.told == [
+        "Ben asks Ana for control.",
+        "Ana gave up control; the arms hold. Ben has control.",
+    ]
 
 
 def test_who_goes_on_driving_keeps_it_and_who_does_nothing_loses_it(room: Room) -> None:
@@ -163,7 +166,7 @@ def test_a_request_is_turned_down_or_forgotten(room: Room) -> None:
     ana.ask()  # free: taken
     ben.ask()
     ana.keep()
-    assert room.told == ["Ana keeps control."]
+    assert room.told[-1] == "Ana keeps control."
     room.pass_time(2 * PATIENCE)
     assert ana.may_drive
     ben.ask()

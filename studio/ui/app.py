@@ -162,7 +162,7 @@ class Page:
             self._system = SystemTab(
                 gui, self._desk, self._studio.data_dir, self.restart_session, self._invitation
             )
-            for button in self._system.for_everybody:
+            for button in (self._first_steps.close, *self._system.for_everybody):
                 self._gate.free(button)
 
         @self._restart.on_click

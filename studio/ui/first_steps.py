@@ -22,8 +22,8 @@ class FirstSteps:
     def __init__(self, gui: viser.GuiApi, *, is_needed: bool) -> None:
         self._done = [not is_needed] * len(STEPS)
         self._card = gui.add_html(card(self._done), visible=is_needed, order=0.1)
-        self._close = gui.add_button("Got it", color="dark", visible=is_needed, order=0.2)
-        self._close.on_click(lambda _: self._tick(*range(len(STEPS))))
+        self.close = gui.add_button("Got it", color="dark", visible=is_needed, order=0.2)
+        self.close.on_click(lambda _: self._tick(*range(len(STEPS))))
 
     def show(self, status: Status, is_reviewed: bool) -> None:
         """`is_reviewed`: somebody has a take open."""
@@ -40,7 +40,7 @@ class FirstSteps:
         for step in steps:
             self._done[step] = True
         self._card.content = card(self._done)
-        self._card.visible = self._close.visible = not all(self._done)
+        self._card.visible = self.close.visible = not all(self._done)
 
 
 def card(done: list[bool]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from html import escape
 
 import numpy as np
 import viser
@@ -135,7 +136,7 @@ def gauge(name: str, newtons: float, peak: float, level: Level) -> str:
     share = min(newtons / MAX_FORCE, 1.0)
     mark = min(peak / MAX_FORCE, 1.0)
     return (
-        f'<div class="gauge"><div class="row"><span>Contact force, {name} arm</span>'
+        f'<div class="gauge"><div class="row"><span>Contact force, {escape(name)} arm</span>'
         f'<span><span class="newtons">{newtons:.1f}</span> N</span></div>'
         f'<div class="track {color}"><div class="fill" style="width:{share:.1%}"></div>'
         f'<div class="peak" style="left:calc({mark:.1%} - 2px)"></div></div>'
