@@ -127,7 +127,7 @@ class _DriverRows:
 
 
 _DRIVER_HINTS: dict[Choice, str] = {
-    "gizmo": "Drag the arrows at the tool; left alone it stays.",
+    "gizmo": 'Drag the arrows at the tool, or <a href="/xr" target="_blank">use a headset</a>.',
     "keyboard": "Hold a key; directions follow your view.",
     "script": "The task's own demonstration runs.",
     "policy": "The run drives. Drag the arrows at the tool to take over, press Policy to hand back.",
