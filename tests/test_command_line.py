@@ -15,6 +15,7 @@ from test_api import doctored
 from studio import __main__ as command_line
 from studio import recorder
 from studio.api import DemoReport, Studio
+from studio.commands import terminal
 from studio.references import REFERENCES
 
 ROOT = Path(__file__).parent.parent
@@ -79,7 +80,7 @@ def test_the_list_fits_80_columns_without_folding_ids(
     piped = studio("episodes", "--data", data)[1].splitlines()
     assert len(piped) == 3  # however long: one line a take
     assert "a-long-flag, another" in "".join(piped)
-    monkeypatch.setattr(command_line.console, "width", 80)
+    monkeypatch.setattr(terminal.console, "width", 80)
     narrow = studio("episodes", "--data", data)[1].splitlines()
     assert max(map(len, narrow)) <= 80
     for episode_id in ids:
@@ -238,7 +239,7 @@ def test_evaluate_ends_with_one_json_object(studio: Run, tmp_path: Path) -> None
 
 def test_evaluate_refuses_nonsense(studio: Run, tmp_path: Path) -> None:
     for arguments, words in (
-        (("nobody", "--task", "wiping"), "No agent 'nobody'"),
+        (("nobody", "--task", "wiping"), "No run 'nobody'"),
         (("nothing", "--task", "wiping", "--seeds", "a:b"), "1000:1020"),
         (("nothing", "--task", "wiping", "--compare", "demonstrator"), "none yet"),
     ):

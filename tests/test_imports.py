@@ -42,7 +42,7 @@ LAYERS = (
         *("references", "evaluation", "evaluate", "report", "probes"),
     ),
     ("api",),
-    ("server", "site", "headset", "ui", "serve", "__main__"),
+    ("server", "site", "headset", "ui", "serve", "commands", "__main__"),
 )
 SKINS = len(LAYERS) - 1
 
