@@ -12,6 +12,7 @@ import getpass
 import hashlib
 import logging
 import os
+import select
 import socket
 import tempfile
 import threading
@@ -194,6 +195,21 @@ class Link:
             return True
         except OSError:
             return False
+
+    def send_at_once(self, command: Message) -> bool:
+        """Whether it could be sent without any waiting."""
+        if not self._sending.acquire(blocking=False):
+            return False
+        try:
+            # A Unix socket counts as writable while most of its buffer is free: a command fits in.
+            if not select.select((), (self._connection,), (), 0.0)[1]:
+                return False
+            self._connection.send_bytes(encode(command))
+            return True
+        except (OSError, ValueError):  # ValueError: closed
+            return False
+        finally:
+            self._sending.release()
 
     def close(self) -> None:
         self._on_close = lambda: None

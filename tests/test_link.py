@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Client
+from multiprocessing.connection import Client, Listener
 from pathlib import Path
 
 import msgspec
@@ -133,3 +133,19 @@ def test_a_malformed_command_is_answered_and_goes_no_further(hub: Hub, tmp_path:
     assert all(isinstance(report, m.Notice) and report.kind == "error" for report in got)
     wait_for(lambda: hub.commands.drain() == [m.Release()])
     client.close()
+
+
+def test_sending_at_once_never_waits_for_a_session_that_reads_nothing(tmp_path: Path) -> None:
+    with Listener(str(tmp_path / "deaf"), family="AF_UNIX") as listener:
+        client = Link(tmp_path / "deaf", lambda report: None)
+        deaf = listener.accept()
+        command = m.Drive(driver="nobody", operator="x" * 200)
+        sent = 0
+        while client.send_at_once(command):  # until the socket is full
+            sent += 1
+        assert sent > 10
+        assert [m.decode_command(deaf.recv_bytes()) for _ in range(sent)] == [command] * sent
+        assert client.send_at_once(command)
+        client.close()
+        assert not client.send_at_once(command)
+        deaf.close()

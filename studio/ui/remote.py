@@ -30,6 +30,7 @@ class Remote:
         self._link: Link | None = None
         self._heard = 0.0  # [s] monotonic time of the newest report
         self._waiting: deque[Command] = deque()
+        self._is_sending = False  # whether the thread has taken one off `_waiting` that is under way
         self._changed = threading.Condition()
         self._framed = threading.Event()
         self._has_status = threading.Event()
@@ -74,6 +75,10 @@ class Remote:
     def post(self, command: Command) -> None:
         """Send soon, in order. A target or hands that still wait are replaced by the next of their kind."""
         with self._changed:
+            # Waking the thread that may wait costs more than all the rest, a hundred times a second.
+            is_next = not (self._waiting or self._is_sending)
+            if is_next and self._link is not None and self._link.send_at_once(command):
+                return
             if self._waiting and _replaces(command, self._waiting[-1]):
                 self._waiting.pop()
             self._waiting.append(command)
@@ -82,7 +87,9 @@ class Remote:
     def _send(self) -> None:
         while True:
             with self._changed:
+                self._is_sending = False
                 self._changed.wait_for(lambda: self._waiting)
+                self._is_sending = True
                 command, link = self._waiting.popleft(), self._link
             if link is not None:
                 link.send(command)  # may wait for a stuck session; nobody waits for us
