@@ -358,6 +358,15 @@ def test_the_stage_looks_at_the_work(model: SceneModel, server: viser.ViserServe
     assert camera.position[2] > camera.look_at[2]
 
 
+def test_whoever_came_before_the_stage_looks_at_it_too(
+    model: SceneModel, server: viser.ViserServer, viewer: Viewer
+) -> None:
+    set_stage(server, model)
+    viewer.settle()
+    (sent,) = [m["look_at"] for m in viewer.messages if m["type"] == "SetCameraLookAtMessage"]
+    assert sent == pytest.approx(server.initial_camera.look_at)
+
+
 def test_a_picture_lies_on_the_plane_that_shows_its_texture(model: SceneModel) -> None:
     match model.picture:
         case Picture(face, width, height):

@@ -357,9 +357,14 @@ def set_stage(server: viser.ViserServer, model: SceneModel) -> None:
     reach = max(float(np.linalg.norm(base - look_at)) for base in model.bases)
     direction = model.first_view / np.linalg.norm(model.first_view)
     distance = (reach + ARM_WIDTH) / np.tan(FIELD_OF_VIEW / 2)
+    position = look_at + distance * direction
     server.initial_camera.look_at = tuple(look_at)
-    server.initial_camera.position = tuple(look_at + distance * direction)
+    server.initial_camera.position = tuple(position)
     server.initial_camera.fov = FIELD_OF_VIEW
+    for client in server.get_clients().values():  # those who came before there was a stage, or to another one
+        with client.atomic():
+            client.camera.position, client.camera.look_at = position, look_at
+            client.camera.fov = FIELD_OF_VIEW
 
 
 def hide(client: viser.ClientHandle, root: str = LIVE) -> viser.FrameHandle:
