@@ -56,7 +56,9 @@ class Learner:
         if config.backbone_weights and isinstance(self.model.vision, ResNet18):
             self.model.vision.read_weights(Path(config.backbone_weights))
         self.model.to(here.device)
-        self.averaged = copy.deepcopy(self.model).eval().requires_grad_(False)
+        self.averaged = self.model  # what is validated and saved to run
+        if config.ema:
+            self.averaged = copy.deepcopy(self.model).requires_grad_(False)
         self.objective: nn.Module = Objective(self.model)
         if here.world > 1:
             self.objective = DistributedDataParallel(self.objective, broadcast_buffers=False)
@@ -104,10 +106,11 @@ class Learner:
 
     def average(self) -> None:
         """After a step: move the averaged weights; at first fast, or they would keep to the start."""
-        decay = min(self.config.ema, (1 + self.step) / (10 + self.step)) if self.config.ema else 0.0
-        with torch.no_grad():
-            for mean, weight in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
-                mean.lerp_(weight, 1.0 - decay)
+        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
+        if self.averaged is not self.model:
+            with torch.no_grad():
+                for mean, weight in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
+                    mean.lerp_(weight, 1.0 - decay)
 
     def is_due(self, every: int, stopping: bool) -> bool:
         """At the end of a run, too."""
@@ -137,6 +140,7 @@ class Learner:
         """The averaged network on the takes kept aside, as it will run: loss, and errors in known units."""
         if not len(self._aside):
             return {}
+        self.averaged.eval()
         losses, errors = [], []
         for indices in np.array_split(self._aside, math.ceil(len(self._aside) / self.config.batch)):
             batch = self.batches.of(indices).to(self.machine.device)
@@ -144,6 +148,7 @@ class Learner:
                 values = self.averaged(batch)
                 losses.append(self.averaged.errors(values, batch)["loss"].item() * len(indices))
             errors.append(self._errors(values.double().cpu().numpy(), indices))
+        self.model.train()
         self._validation = sum(losses) / len(self._aside)
         self.is_best = self.best is None or self._validation < self.best
         self.best = self._validation if self.is_best else self.best
@@ -237,7 +242,7 @@ class Learner:
 
     def _restore(self, told: Checkpoint, folder: Path) -> None:
         self.step, self.best, self._validation = told.spec.step, told.best, told.validation
-        self.averaged.load_state_dict(load_file(folder / checkpoint.MODEL))
+        self.averaged.load_state_dict(load_file(folder / checkpoint.MODEL))  # the raw weights come after
         state = load_file(folder / checkpoint.TRAINING)
         weights = {name: value for name, value in state.items() if name.startswith("weight/")}
         self.model.load_state_dict({name.removeprefix("weight/"): value for name, value in weights.items()})

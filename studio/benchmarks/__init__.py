@@ -24,6 +24,7 @@ PARTS = (
     "proxy",
     "review",
     "page",
+    "policy",
 )
 
 Results = dict[str, Any]  # what a part measured
@@ -120,4 +121,10 @@ GOALS = (
     Goal("xr", "the same while others download, p95 [ms]", lambda r: r["with_downloads_p95_ms"], "<=", 25.0),
     Goal("xr", "poses that arrived, share", lambda r: r["arrived"], ">=", 0.99),
     Goal("xr", "two hands at 120 Hz, share of a core", lambda r: r["two_hands_share_of_core"], "<=", 0.06),
+    Goal("policy", "small, training step at batch 16 [s]", lambda r: r["small_step_s"], "<=", 0.16),
+    Goal("policy", "small, an answer [ms]", lambda r: r["small_answer_ms"], "<=", 15.0),
+    Goal("policy", "small, reading data, share of a step", lambda r: r["small_data_share"], "<=", 0.05),
+    Goal("policy", "small, peak memory of training [GB]", lambda r: r["small_peak_GB"], "<=", 4.0),
+    Goal("policy", "paper at 240x320, step at batch 8 [s]", lambda r: r["paper_step_s"], "<=", 7.0),
+    Goal("policy", "the same, one decoder layer [s]", lambda r: r["shallow_step_s"], "<=", 3.9),
 )
