@@ -11,14 +11,15 @@ import pytest
 import viser
 
 from controller.types import Array, Pose, Wrench
+from studio import meshes
 from studio.benchmarks import scene as benchmark
 from studio.benchmarks.scene import Viewer
 from studio.board import CELL, CELLS, HALF, Board
+from studio.meshes import Mesh
 from studio.server import start_viser
 from studio.tasks.wiping import BOARD_CENTER
-from studio.ui import marks, meshes
+from studio.ui import marks
 from studio.ui.marks import AMBER, CALM, RED, force_arrow, force_color
-from studio.ui.meshes import Mesh
 from studio.ui.scene import INK_PERIOD, LIVE, REVIEW, Picture, SceneModel, SceneView, hide, set_stage
 
 TWO_ARMS = "studio.benchmarks.two_arms"

@@ -6,8 +6,8 @@ import numpy as np
 import viser
 
 from controller.types import Array, Pose, Wrench, rotation_vector
+from studio.meshes import Mesh, linear
 from studio.messages import Level
-from studio.ui.meshes import Mesh, linear
 
 Rgb = tuple[int, int, int]
 

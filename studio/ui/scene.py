@@ -16,13 +16,13 @@ import numpy as np
 import viser
 
 from controller.types import Array, Pose, Wrench
-from studio import tasks
+from studio import meshes, tasks
+from studio.meshes import Mesh
 from studio.messages import Level
 from studio.tasks import ArmSetup
 from studio.twin import build_model
-from studio.ui import marks, meshes
+from studio.ui import marks
 from studio.ui.marks import Ghost, Trail, WorkspaceMark, WrenchMark
-from studio.ui.meshes import Mesh
 
 RATE = 30.0  # [Hz] at which a view is meant to be updated
 INK_PERIOD = 0.2  # [s] between two pictures of the board; one is 2 kB, and eyes do not ask for more

@@ -1,4 +1,4 @@
-"""Meshes for the page from a MuJoCo model: what can be seen, merged per body and material, as binary glTF."""
+"""Meshes for the page and for exports, from a MuJoCo model: what can be seen, as binary glTF."""
 
 from __future__ import annotations
 
