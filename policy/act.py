@@ -123,7 +123,7 @@ class Act(nn.Module):
         """The scalar `loss`, and what it is made of: L1 of each group, KL of the latent."""
         if not self.has_cvae:
             return self.errors(self(batch), batch)
-        mean, log_variance = self.posterior(batch, batch.action, batch.valid)
+        mean, log_variance = (x.float() for x in self.posterior(batch, batch.action, batch.valid))
         latent = mean + torch.exp(log_variance / 2) * torch.randn_like(mean)
         kl = -0.5 * (1 + log_variance - mean**2 - log_variance.exp()).sum(-1).mean()
         told = self.errors(self._actions(batch, latent), batch)
@@ -133,7 +133,7 @@ class Act(nn.Module):
         """Weighted L1 of predicted actions (B, chunk, action width) as `loss`, and that of each group."""
         assert batch.action is not None
         assert batch.valid is not None
-        error = (actions - batch.action).abs()
+        error = (actions.float() - batch.action).abs()  # whole precision, also where the network has half
         valid = batch.valid.to(error.dtype)
         # The mean over a chunk's valid steps, then over the chunks: each moment of a take counts the same.
         of_chunk = (error * valid[..., None]).sum(1) / valid.sum(1).clamp(min=1)[:, None]  # (B, width)
@@ -175,7 +175,7 @@ class Act(nn.Module):
             pixels = (pixels - 0.5) * contrast + (0.5 + brightness)
         pixels = (pixels - self.image_mean) / self.image_std * (not hide)
         maps = self.image_token(self.vision(pixels.flatten(0, 1).permute(0, 3, 1, 2)))  # (B c, d, h', w')
-        grid = _sine_grid(maps.shape[2], maps.shape[3], maps.shape[1]).to(maps)  # (h' w', d)
+        grid = _sine_grid(maps.shape[2], maps.shape[3], maps.shape[1], maps.device)  # (h' w', d)
         tokens = maps.flatten(2).transpose(1, 2).reshape(len(pixels), -1, maps.shape[1])
         return tokens, (self.camera + grid[None]).reshape(1, -1, maps.shape[1])
 
@@ -218,7 +218,7 @@ class Posterior(nn.Module):
         self.out = nn.Linear(d, 2 * config.latent)
         n_wrench_tokens = WrenchEncoder.count(config.wrench_history) if config.wrench else 0
         n = 2 + n_wrench_tokens + config.chunk
-        self.register_buffer("positions", _sine_line(n, d)[None], persistent=False)
+        self.register_buffer("positions", _sine_line(n, d, torch.device("cpu"))[None], persistent=False)
 
     def forward(self, batch: Batch, action: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         tokens = [self.summary.expand(len(action), -1, -1), self.state(batch.state)[:, None]]
@@ -332,15 +332,15 @@ def _loss_weights(config: TrainConfig, groups: Mapping[Group, list[int]], width:
     return weights
 
 
-def _sine_line(n: int, d: int) -> Tensor:
+def _sine_line(n: int, d: int, device: torch.device) -> Tensor:
     """(n, d) sinusoidal positions of a sequence (Vaswani et al. 2017)."""
-    frequency = torch.exp(torch.arange(0, d, 2) * (-math.log(10_000.0) / d))
-    angles = torch.arange(n)[:, None] * frequency
+    frequency = torch.exp(torch.arange(0, d, 2, device=device) * (-math.log(10_000.0) / d))
+    angles = torch.arange(n, device=device)[:, None] * frequency
     return torch.stack((angles.sin(), angles.cos()), dim=-1).flatten(1)
 
 
-def _sine_grid(height: int, width: int, d: int) -> Tensor:
+def _sine_grid(height: int, width: int, d: int, device: torch.device) -> Tensor:
     """(height * width, d) sinusoidal positions in an image, half for rows, half for columns, as in DETR."""
-    rows = _sine_line(height, d // 2)[:, None].expand(-1, width, -1)
-    columns = _sine_line(width, d // 2)[None].expand(height, -1, -1)
+    rows = _sine_line(height, d // 2, device)[:, None].expand(-1, width, -1)
+    columns = _sine_line(width, d // 2, device)[None].expand(height, -1, -1)
     return torch.cat((rows, columns), dim=-1).flatten(0, 1)

@@ -63,7 +63,7 @@ def load_policy(
 ) -> Policy:
     """The policy of a checkpoint, or of a run's last one. Imports torch.
 
-    `hide_images` and `hide_wrench` blank an input to its mean: a control of whether the policy uses it.
+    `hide_images` shows one grey, `hide_wrench` the mean force: a control of whether the policy uses them.
     `threads` of torch, for the whole process; with more, nothing is answered sooner (`studio bench`).
     """
     from policy.inference import load

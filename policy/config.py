@@ -73,7 +73,8 @@ class TrainConfig:
     batch: int = 16
     """Per process."""
     lr: float = 5e-4
-    backbone_lr: float = 5e-4
+    backbone_lr: float | None = None
+    """Of what reads the images; --lr if not given."""
     weight_decay: float = 1e-4
     warm_up: int = 200
     """Steps of rising learning rate, before the cosine."""
@@ -101,7 +102,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("rate", "chunk_seconds", "lr", "backbone_lr", "clip"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
+            if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{_flag(name)} must be above 0, not {value}.")
         for name in _COUNTS:
             if getattr(self, name) < 1:
@@ -174,7 +175,6 @@ PRESETS: dict[Preset, TrainConfig] = {
         steps=20_000,
         batch=8,
         lr=1e-5,
-        backbone_lr=1e-5,
         warm_up=1000,
         clip=10.0,
         ema=0.0,

@@ -61,7 +61,7 @@ class Learner:
             self.averaged = copy.deepcopy(self.model).requires_grad_(False)
         self.objective: nn.Module = Objective(self.model)
         if here.world > 1:
-            self.objective = DistributedDataParallel(self.objective, broadcast_buffers=False)
+            self.objective = DistributedDataParallel(self.objective)
         self.optimizer = torch.optim.AdamW(
             self._parameter_groups(), weight_decay=config.weight_decay, fused=True
         )
@@ -128,7 +128,7 @@ class Learner:
         return rising * 0.5 * (1 + math.cos(math.pi * max(0, self.step - warm) / max(1, steps - warm)))
 
     def _parameter_groups(self) -> list[dict[str, Any]]:
-        lrs = {True: self.config.backbone_lr, False: self.config.lr}
+        lrs = {True: self.config.backbone_lr or self.config.lr, False: self.config.lr}
         groups: dict[bool, list[Tensor]] = {True: [], False: []}
         for name, parameter in self.model.named_parameters():
             groups[name.startswith("vision.")].append(parameter)

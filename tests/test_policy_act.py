@@ -180,3 +180,16 @@ def test_settings_that_make_no_sense_are_refused(wrong: dict[str, object], why: 
 def test_the_chunk_of_the_paper_is_100_steps_of_2_5_seconds() -> None:
     assert PRESETS["paper"].chunk == 100
     assert PRESETS["small"].chunk == 40
+
+
+def test_half_precision_gives_nearly_the_same_loss_in_whole_precision() -> None:
+    config = dataclasses.replace(TINY, cvae=True)
+    model, encoding = built(config)
+    batch = batch_for(config, encoding)
+    losses = []
+    for half in (False, True):
+        torch.manual_seed(2)  # of the latent
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            losses.append(model.loss(batch)["loss"])
+    assert losses[1].dtype == torch.float32
+    assert losses[1].item() == pytest.approx(losses[0].item(), rel=0.02)

@@ -80,7 +80,7 @@ def test_two_takes_are_learned_by_heart(tmp_path: Path) -> None:
     cameras = {"front": (32, 32)}
     takes = [Synthetic(str(goal), goal=goal, cameras=cameras) for goal in (-0.8, 0.8)]
     two = dataset_of(tmp_path / "cache", *takes)
-    quick = {"steps": 200, "dropout": 0.0, "brightness": 0.0, "lr": 1e-3, "backbone_lr": 1e-3, "ema": 0.9}
+    quick = {"steps": 200, "dropout": 0.0, "brightness": 0.0, "lr": 1e-3, "ema": 0.9}
     config = dataclasses.replace(TINY, **quick, validation=0.0, warm_up=10, clip=1.0, save_every=1000)
     result = train(config, two, tmp_path / "run")
     assert result.is_finished
