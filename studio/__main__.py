@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from policy.config import PRESETS
-from studio.commands import machine, policies, recording, serving, takes
+from studio.commands import dataset, machine, policies, recording, serving, takes
 from studio.commands.terminal import complain
 
 COMMANDS: dict[str, Callable[..., int]] = {
@@ -35,6 +35,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "restore": takes.restore,
     "recover": takes.recover,
     "replay": takes.replay,
+    "health": dataset.health,
     "steamvr": serving.steamvr,
     "bench": machine.bench,
 }

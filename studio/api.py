@@ -15,11 +15,12 @@ from controller.servo import ServoConfig
 from controller.stiffness import StiffnessTable
 from policy.config import TrainConfig
 from studio import replay as replays
-from studio import tasks, training
+from studio import survey, tasks, training
 from studio.catalog import Catalog, Refreshed
 from studio.episode import Episode, open_episode
 from studio.evaluate import Plan, evaluate
 from studio.evaluation import Evaluation, Rollout, find
+from studio.health import TakeHealth
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
 from studio.pilot import runs_of
@@ -195,6 +196,23 @@ class Studio:
     def restore(self, episode_id: str) -> EpisodeRow:
         """Bring a take back from the trash."""
         return self.catalog.restore(episode_id)
+
+    def health(
+        self,
+        takes: Sequence[EpisodeRow] | None = None,
+        *,
+        on_take: Callable[[TakeHealth], None] = lambda health: None,
+    ) -> survey.DatasetHealth:
+        """What is wrong with some takes, or with all, and with them together; leaves none out.
+
+        A take that is examined for the first time is read whole.
+        """
+        found = []
+        for row in self.episodes() if takes is None else takes:
+            told = survey.examine(self.data_dir, row)
+            found.append((row, told))
+            on_take(told)
+        return survey.survey(found)
 
     def replay(self, episode_id: str) -> replays.Replay:
         """Simulate a take again and compare it tick by tick."""
