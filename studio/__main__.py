@@ -36,6 +36,8 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "recover": takes.recover,
     "replay": takes.replay,
     "health": dataset.health,
+    "collections": dataset.show_collections,
+    "collection": dataset.collection,
     "steamvr": serving.steamvr,
     "bench": machine.bench,
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -14,9 +15,11 @@ from typing import TYPE_CHECKING, Any, Unpack
 from controller.servo import ServoConfig
 from controller.stiffness import StiffnessTable
 from policy.config import TrainConfig
+from studio import collections, survey, tasks, training
+from studio import export as exports
 from studio import replay as replays
-from studio import survey, tasks, training
 from studio.catalog import Catalog, Refreshed
+from studio.collections import Change, Collection
 from studio.episode import Episode, open_episode
 from studio.evaluate import Plan, evaluate
 from studio.evaluation import Evaluation, Rollout, find
@@ -130,10 +133,22 @@ class Studio:
         name: str | None = None,
         episodes: int | None = None,
         filters: Filters | None = None,
+        collection: str | None = None,
     ) -> training.Run:
-        """A run that learns a task from successful demonstrations, or from those that `filters` ask for."""
+        """A run that learns a task from successful demonstrations, or from those that `filters` ask for.
+
+        A `collection` tells which takes instead.
+        """
         tasks.load(task)
-        return training.prepare(self.catalog, task, config, name=name, episodes=episodes, filters=filters)
+        return training.prepare(
+            self.catalog,
+            task,
+            config,
+            name=name,
+            episodes=episodes,
+            filters=filters,
+            collection=collection,
+        )
 
     def run(self, name: str) -> training.Run:
         """One that was begun, to go on with."""
@@ -189,13 +204,61 @@ class Studio:
         """Append an edit: outcome, quality, note, trim, add_flags, remove_flags, put_segments …"""
         return self.catalog.annotate(episode_id, author=author or getpass.getuser(), **changes)
 
-    def delete(self, episode_id: str) -> EpisodeRow:
-        """Move a take to the trash."""
-        return self.catalog.delete(episode_id)
+    def annotate_all(
+        self, episode_ids: Sequence[str], *, author: str | None = None, **changes: Any
+    ) -> list[EpisodeRow]:
+        """The same edit to several takes, or to none."""
+        return self.catalog.annotate_all(episode_ids, author=author or getpass.getuser(), **changes)
+
+    def delete(self, episode_id: str, *, even_if_used: bool = False) -> EpisodeRow:
+        """Move a take to the trash; one in a collection only `even_if_used`."""
+        return self.catalog.delete(episode_id, even_if_used=even_if_used)
 
     def restore(self, episode_id: str) -> EpisodeRow:
         """Bring a take back from the trash."""
         return self.catalog.restore(episode_id)
+
+    # Collections
+
+    def make_collection(
+        self,
+        name: str,
+        *,
+        episode_ids: Sequence[str] | None = None,
+        filters: Filters | None = None,
+        author: str | None = None,
+        note: str = "",
+    ) -> Collection:
+        """Name some takes, or all that match, as they are now."""
+        author = author or getpass.getuser()
+        return collections.create(
+            self.catalog, name, author=author, episode_ids=episode_ids, filters=filters, note=note
+        )
+
+    def collections(self) -> list[Collection]:
+        """The newest first."""
+        return collections.load_all(self.data_dir)
+
+    def collection(self, name: str) -> Collection:
+        return collections.load(self.data_dir, name)
+
+    def collection_rows(self, name: str) -> list[EpisodeRow]:
+        """The takes of a collection, as they were annotated when it was made."""
+        return collections.rows_of(self.catalog, self.collection(name))
+
+    def collection_changes(self, name: str) -> list[Change]:
+        """What became of them since."""
+        return collections.changes(self.catalog, self.collection(name))
+
+    def delete_collection(self, name: str) -> None:
+        """Move a collection to the trash; its takes stay."""
+        collections.delete(self.data_dir, name)
+
+    def restore_collection(self, name: str) -> Collection:
+        """Bring it back."""
+        return collections.restore(self.data_dir, name)
+
+    # Looking closer
 
     def health(
         self,
@@ -213,6 +276,25 @@ class Studio:
             found.append((row, told))
             on_take(told)
         return survey.survey(found)
+
+    def export(
+        self,
+        episode_ids: Sequence[str],
+        out: str | Path,
+        form: exports.Format,
+        options: exports.Options | None = None,
+        *,
+        versions: Mapping[str, int] | None = None,
+        on_progress: Callable[[float, str], None] = lambda share, what: None,
+        cancel: threading.Event | None = None,
+    ) -> exports.Exported:
+        """Write takes for other programs to a new folder, all or nothing.
+
+        They go as they are annotated now, or as `versions` of their edits told them, by id.
+        `on_progress` hears the share done and the take in work; setting `cancel` ends it.
+        """
+        takes = exports.choose(self.catalog, episode_ids, versions)
+        return exports.export(takes, form, Path(out), options, on_progress, cancel)
 
     def replay(self, episode_id: str) -> replays.Replay:
         """Simulate a take again and compare it tick by tick."""

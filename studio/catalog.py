@@ -21,17 +21,36 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from studio import edits
+from studio import collections, edits
 from studio.edits import Edit, Outcome, edits_path, sync_folder
 from studio.episode import open_episode
 from studio.index import FACETS, SORTS, EpisodeRow, Filters, Index, Stamps, Summary
 
-__all__ = ["FACETS", "SORTS", "Catalog", "EpisodeRow", "Filters", "Refreshed", "Summary", "summarise"]
+__all__ = [
+    "FACETS",
+    "SORTS",
+    "Catalog",
+    "EpisodeRow",
+    "Filters",
+    "InUseError",
+    "NotFinishedError",
+    "Refreshed",
+    "Summary",
+    "summarise",
+]
 
 CONTACT = 1.0  # [N] a larger force counts as contact
 BATCH = 0.5  # [s] of reading recordings between two commits of `refresh`
 OVERHANG = 0.05  # [s] of one image: a player rounds the end of a take up to it
 PLACES = ("episodes", "trash")
+
+
+class InUseError(ValueError):
+    """A take that is to be deleted is in a collection."""
+
+
+class NotFinishedError(KeyError):
+    """A take that is asked for is still being recorded, or waits for `studio recover`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +155,18 @@ class Catalog:
             self.refresh()
             row = self._index.by_id(episode_id)
         if row is None or self._is_in_trash(row.path):
-            raise KeyError(self._why_missing(episode_id))
+            raise self._missing(episode_id)
         return row
+
+    def get_as_of(self, episode_id: str, edit_version: int) -> EpisodeRow:
+        """A take as it was annotated then. Raises ValueError where its sidecar has fewer edits."""
+        row = self.get(episode_id)
+        return _row(row, edits.read(edits_path(row.path), edit_version), row.path)
+
+    def known(self, episode_ids: Sequence[str]) -> list[EpisodeRow]:
+        """Those of the takes that are in the index and not in the trash."""
+        found = [self._index.by_id(episode_id) for episode_id in episode_ids]
+        return [row for row in found if row is not None and not self._is_in_trash(row.path)]
 
     def trash(self) -> list[EpisodeRow]:
         """The deleted takes, the newest first."""
@@ -149,13 +178,21 @@ class Catalog:
 
     def annotate(self, episode_id: str, *, author: str, **changes: Any) -> EpisodeRow:
         """Append an edit to the take's sidecar; `changes` are fields of `studio.edits.Edit`."""
+        return self.annotate_all([episode_id], author=author, **changes)[0]
+
+    def annotate_all(self, episode_ids: Sequence[str], *, author: str, **changes: Any) -> list[EpisodeRow]:
+        """One edit to several takes; to none where one of them is missing or the edit does not fit."""
         edit = _edit(author, changes)
         with self._folder_lock():
-            row = self._get_on_disk(episode_id)
-            _check_times(edit, row)
-            edits.append(edits_path(row.path), edit)
-            self._read([row.path])
-        return self.get(episode_id)
+            rows = [self._get_on_disk(episode_id) for episode_id in dict.fromkeys(episode_ids)]
+            if edit.undo is not None and len(rows) > 1:
+                raise ValueError("An edit is taken back take by take; see `undo`.")
+            for row in rows:
+                _check_times(edit, row)
+            for row in rows:
+                edits.append(edits_path(row.path), edit)
+            self._read([row.path for row in rows])
+        return [self.get(row.episode_id) for row in rows]
 
     def undo(self, episode_id: str, *, author: str) -> EpisodeRow:
         """Take back the newest edit of `author` that still counts."""
@@ -164,10 +201,19 @@ class Catalog:
             raise KeyError(f"{author!r} has no edit of {episode_id} to take back.")
         return self.annotate(episode_id, author=author, undo=edit.edit_id)
 
-    def delete(self, episode_id: str) -> EpisodeRow:
-        """Move a take and its sidecar to the trash, from where `restore` brings it back."""
+    def delete(self, episode_id: str, *, even_if_used: bool = False) -> EpisodeRow:
+        """Move a take and its sidecar to the trash, from where `restore` brings it back.
+
+        Raises `InUseError` where it is in a collection, unless it may go `even_if_used`.
+        """
         with self._folder_lock():
+            using = [] if even_if_used else collections.holding(self.data_dir, episode_id)
             source = self._get_on_disk(episode_id).path
+            if using:
+                raise InUseError(
+                    f"{episode_id} is in {_some(using)}: a collection names what a run has seen. Delete the "
+                    "collection first, or insist (`studio delete --even-if-used`)."
+                )
             target = self._place(source, "trash")
             source.rename(target)
             _move_edits(source, target)  # a crash before this leaves the sidecar where `restore` wants it
@@ -274,19 +320,24 @@ class Catalog:
         row = self.get(episode_id)
         if not row.path.exists():  # moved away by hand
             self.refresh()
-            raise KeyError(self._why_missing(episode_id))
+            raise self._missing(episode_id)
         return row
 
-    def _why_missing(self, episode_id: str) -> str:
+    def _missing(self, episode_id: str) -> KeyError:
         """Why there is no such take, and what to do."""
+        parts = (self.data_dir / "episodes").glob("*/*.mcap.part")
+        if any(part.name == f"{episode_id}.mcap.part" for part in parts):
+            return NotFinishedError(
+                f"Episode {episode_id!r} is still being recorded, or waits for `studio recover`."
+            )
+        return KeyError(self._why_missing(episode_id))
+
+    def _why_missing(self, episode_id: str) -> str:
         if any(row.episode_id == episode_id for row in self.trash()):
             return f"Episode {episode_id!r} is in the trash; `studio restore {episode_id}` brings it back."
         for path, why in self.unreadable().items():
             if path.stem == episode_id:
                 return why
-        parts = (self.data_dir / "episodes").glob("*/*.mcap.part")
-        if any(part.name == f"{episode_id}.mcap.part" for part in parts):
-            return f"Episode {episode_id!r} is still being recorded, or waits for `studio recover`."
         ids = self._index.ids()
         if not ids:
             return f"No episode {episode_id!r}: there are none in {self.data_dir}."

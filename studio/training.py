@@ -27,6 +27,7 @@ from policy.checkpoint import CONFIG, read_spec
 from policy.config import TrainConfig
 from policy.dataset import FORMAT, Dataset
 from policy.recording import ArmTrack, Recording
+from studio import collections
 from studio.catalog import Catalog
 from studio.episode import Episode, open_episode
 from studio.index import EpisodeRow, Filters
@@ -47,11 +48,13 @@ class Chosen:
 
     episode_id: str
     trim: tuple[float, float] | None = None  # [s] since the take's start
+    edit_version: int | None = None  # see `studio.edits.read`; None in runs that did not note it
 
     @staticmethod
     def from_json(fields: Mapping[str, Any]) -> Chosen:
         trim = fields["trim"]
-        return Chosen(fields["episode_id"], None if trim is None else (trim[0], trim[1]))
+        version = fields.get("edit_version")
+        return Chosen(fields["episode_id"], None if trim is None else (trim[0], trim[1]), version)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +80,12 @@ def prepare(
     name: str | None = None,
     episodes: int | None = None,
     filters: Filters | None = None,
+    collection: str | None = None,
 ) -> Run:
     """A new run of successful demonstrations of a task, or of those that `filters` ask for.
 
-    `episodes` takes the first so many recorded. Raises ValueError where none matches.
+    `episodes` takes the first so many recorded. A `collection` tells the takes instead: all of them, as they
+    were annotated when it was made. Raises ValueError where none matches, or one is of another task.
     """
     name = name or f"{task}-{config.policy}-{time.strftime('%Y%m%d-%H%M%S')}"
     if not _NAME.fullmatch(name):
@@ -89,13 +94,14 @@ def prepare(
     if folder.exists() and leads():
         raise ValueError(f"There is a run {name} already; resume it, or give another name.")
     catalog.refresh()
-    asked: Filters = {"outcome": "success", **(filters or {})}
-    rows = _select(catalog, {**asked, "task": task})
-    if not rows:
-        raise ValueError(_why_none(catalog, task, asked))
+    rows = (
+        _named(catalog, task, collection, filters)
+        if collection is not None
+        else _asked(catalog, task, {"outcome": "success", **(filters or {})})
+    )
     if episodes is not None and not 1 <= episodes <= len(rows):
         raise ValueError(f"{len(rows)} takes match, so that many or fewer can be asked for, not {episodes}.")
-    takes = tuple(Chosen(row.episode_id, row.trim) for row in rows[:episodes])
+    takes = tuple(Chosen(row.episode_id, row.trim, row.edit_version) for row in rows[:episodes])
     return Run(folder, task, config, takes)
 
 
@@ -205,6 +211,25 @@ class _TakeRecording:
 
 
 _STATE = ("base_from_tcp", "q", "q_command", "wrench", "gripper")
+
+
+def _asked(catalog: Catalog, task: str, asked: Filters) -> list[EpisodeRow]:
+    rows = _select(catalog, {**asked, "task": task})
+    if not rows:
+        raise ValueError(_why_none(catalog, task, asked))
+    return rows
+
+
+def _named(catalog: Catalog, task: str, name: str, filters: Filters | None) -> list[EpisodeRow]:
+    if any((filters or {}).values()):
+        raise ValueError(f"The collection {name!r} tells which takes; leave out all filters.")
+    rows = collections.rows_of(catalog, collections.load(catalog.data_dir, name))
+    others = sorted({row.task for row in rows} - {task})
+    if others:
+        raise ValueError(
+            f"The collection {name!r} has takes of {', '.join(others)}, too, not only of {task}."
+        )
+    return rows
 
 
 def _select(catalog: Catalog, filters: Filters) -> list[EpisodeRow]:

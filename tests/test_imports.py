@@ -39,7 +39,7 @@ LAYERS = (
     ("twin", "cameras", "inputs", "policy_link"),
     (
         *("recorder", "catalog", "replay", "training", "jobs", "export", "pilot"),
-        *("references", "evaluation", "evaluate", "report", "probes", "health", "survey"),
+        *("references", "evaluation", "evaluate", "report", "probes", "health", "survey", "collections"),
     ),
     ("api",),
     ("server", "site", "headset", "ui", "serve", "commands", "__main__"),

@@ -89,17 +89,22 @@ def test_a_rollout_is_no_demonstration(data: Path) -> None:
         studio.annotate(rollout.episode_id, author="test", outcome="success")
         assert rollout.episode_id not in {t.episode_id for t in studio.begin_run("wiping", QUICK, "a").takes}
         asked: Filters = {"operator": training.EVALUATION}
-        assert studio.begin_run("wiping", QUICK, "b", filters=asked).takes == (Chosen(rollout.episode_id),)
+        assert studio.begin_run("wiping", QUICK, "b", filters=asked).takes == (
+            Chosen(rollout.episode_id, None, 1),
+        )
 
 
 def test_only_what_is_asked_for_is_learned_from(data: Path) -> None:
     with Studio(data) as studio:
         first, second = (row.episode_id for row in studio.episodes()[::-1])
         studio.annotate(first, author="test", trim=(0.5, 2.0))
-        assert studio.begin_run("wiping", QUICK, "a").takes == (Chosen(first, (0.5, 2.0)), Chosen(second))
-        assert studio.begin_run("wiping", QUICK, "b", episodes=1).takes == (Chosen(first, (0.5, 2.0)),)
+        assert studio.begin_run("wiping", QUICK, "a").takes == (
+            Chosen(first, (0.5, 2.0), 1),
+            Chosen(second, None, 0),
+        )
+        assert studio.begin_run("wiping", QUICK, "b", episodes=1).takes == (Chosen(first, (0.5, 2.0), 1),)
         studio.annotate(first, author="test", outcome="failure")
-        assert studio.begin_run("wiping", QUICK, "c").takes == (Chosen(second),)
+        assert studio.begin_run("wiping", QUICK, "c").takes == (Chosen(second, None, 0),)
         with pytest.raises(ValueError, match="1 takes match"):
             studio.begin_run("wiping", QUICK, "d", episodes=2)
         studio.annotate(second, author="test", outcome="unmarked")

@@ -35,6 +35,7 @@ def train(
     operator: str | None = None,
     min_quality: int | None = None,
     flags: tuple[str, ...] = (),
+    collection: str | None = None,
     data: Data = DATA,
     json: Json = False,
 ) -> int:
@@ -48,6 +49,7 @@ def train(
         agent: Only from what this agent demonstrated.
         operator: Only from what this person demonstrated.
         flags: All of these must be set.
+        collection: Exactly these takes, as they were annotated when it was made; see `studio collection`.
     """
     from studio import training
     from studio.api import Studio
@@ -59,7 +61,11 @@ def train(
     quiet = json or not training.leads()
     with Studio(data) as studio:
         filters: Filters = {"agent": agent, "operator": operator, "min_quality": min_quality, "flags": flags}
-        run = studio.run(resume) if resume else studio.begin_run(task, config, name, episodes, filters)
+        run = (
+            studio.run(resume)
+            if resume
+            else studio.begin_run(task, config, name, episodes, filters, collection)
+        )
         total = run.config.steps - run.done
         with progress(f"{run.folder.name}, {len(run.takes)} takes", total, quiet=quiet) as advance:
 

@@ -127,12 +127,16 @@ def annotate(
     return 0
 
 
-def delete(episode_id: Positional[EpisodeId], data: Data = DATA) -> int:
-    """Move an episode to the trash; `studio restore` brings it back."""
+def delete(episode_id: Positional[EpisodeId], even_if_used: bool = False, data: Data = DATA) -> int:
+    """Move an episode to the trash; `studio restore` brings it back.
+
+    Args:
+        even_if_used: Also one that a collection names.
+    """
     from studio.api import Studio
 
     with Studio(data) as studio:
-        studio.delete(episode_id)
+        studio.delete(episode_id, even_if_used=even_if_used)
     console.print(f"{episode_id} is in the trash; `studio restore {episode_id}` brings it back.")
     return 0
 
