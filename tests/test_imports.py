@@ -27,7 +27,7 @@ ONLY_IN = {
     "openvr": ("studio/inputs/steamvr.py",),
     "ray": ("studio/jobs.py",),
     "h5py": ("studio/export/act_hdf5.py",),
-    "av": ("studio/export/lerobot.py",),
+    "av": ("studio/export/video.py",),
     "sqlite3": ("studio/index.py",),
     "matplotlib": ("studio/report.py",),
 }

@@ -17,7 +17,7 @@ from studio.export.source import Control, Take, check_alike, choose
 
 __all__ = ["FORMATS", "Cancelled", "Exported", "Format", "Options", "Take", "choose", "export"]
 
-Format = Literal["act-hdf5", "rrd"]
+Format = Literal["lerobot", "act-hdf5", "rrd"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 
