@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fcntl
-import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,11 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
-import numpy as np
-
 from studio import collections, edits
 from studio.edits import Edit, Outcome, edits_path, sync_folder
-from studio.episode import open_episode
+from studio.episode import open_episode, totals_of
 from studio.index import FACETS, SORTS, EpisodeRow, Filters, Index, Stamps, Summary
 
 __all__ = [
@@ -39,7 +36,6 @@ __all__ = [
     "summarise",
 ]
 
-CONTACT = 1.0  # [N] a larger force counts as contact
 BATCH = 0.5  # [s] of reading recordings between two commits of `refresh`
 OVERHANG = 0.05  # [s] of one image: a player rounds the end of a take up to it
 PLACES = ("episodes", "trash")
@@ -63,31 +59,29 @@ class Refreshed:
 
 
 def summarise(path: Path) -> Summary:
-    """What the catalogue keeps of a recording. Reads all its forces, so once per take."""
-    with open_episode(path) as episode:
-        header, outcome = episode.header, episode.outcome
-        columns = episode.columns(*(f"{arm}/state" for arm in header.arms))
-        wrenches = np.concatenate([columns[f"{arm}/state/wrench"] for arm in header.arms])
-        norms = np.linalg.norm(wrenches[:, :3], axis=1)
-        norms = norms[np.isfinite(norms)]  # a dead sensor sends NaN
-        in_contact = norms[norms > CONTACT]
-        return Summary(
-            episode_id=header.episode_id,
-            task=header.task,
-            instruction=header.instruction,
-            operator=header.operator,
-            agent=header.agent,
-            seed=header.seed,
-            started=header.started,
-            duration=episode.duration,
-            arms=header.arms,
-            cameras=tuple(episode.cameras),
-            recorded_success=outcome.success,
-            progress=None if math.isnan(outcome.progress) else outcome.progress,
-            recovered=any(event.kind == "recovered" for event in episode.events()),
-            peak_force=float(norms.max(initial=0.0)),
-            mean_force=float(in_contact.mean()) if len(in_contact) else 0.0,
-        )
+    """What the catalogue keeps of a recording; reads all its forces only where nobody summed them up."""
+    found = totals_of(path)
+    if found is None:
+        with open_episode(path) as episode:
+            found = episode.header, episode.totals
+    header, totals = found
+    return Summary(
+        episode_id=header.episode_id,
+        task=header.task,
+        instruction=header.instruction,
+        operator=header.operator,
+        agent=header.agent,
+        seed=header.seed,
+        started=header.started,
+        duration=totals.duration,
+        arms=header.arms,
+        cameras=totals.cameras,
+        recorded_success=totals.success,
+        progress=totals.progress,
+        recovered=totals.recovered,
+        peak_force=totals.peak_force,
+        mean_force=totals.mean_force,
+    )
 
 
 class Catalog:

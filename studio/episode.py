@@ -32,7 +32,9 @@ import numpy as np
 
 from controller.types import Action, ArmAction, Array, Limit, Snapshot
 from studio import schema
-from studio.mcap_file import EpisodeError, McapFile
+from studio.mcap_file import EpisodeError, McapFile, metadata_of
+from studio.totals import METADATA as TOTALS
+from studio.totals import ForceTally, Totals
 
 __all__ = ["Episode", "EpisodeError", "Event", "Header", "Outcome", "open_episode"]
 
@@ -142,6 +144,16 @@ class Event:
     text: str
 
 
+def totals_of(path: Path) -> tuple[Header, Totals] | None:
+    """What a finished take comes to, read in a millisecond; None where it was not written down.
+
+    Raise `EpisodeError` where the header cannot be read.
+    """
+    found = metadata_of(path)
+    totals = Totals.from_entries(found.get(TOTALS, {}))
+    return None if totals is None else (Header.from_json(found[METADATA]["header"]), totals)
+
+
 def open_episode(path: Path) -> Episode:
     """Open a finished take. Raise `EpisodeError` with what is wrong with the file, and what helps."""
     return Episode(path)
@@ -182,6 +194,23 @@ class Episode:
         """[s] of simulated time from the first state to the last."""
         ns = self._mcap.log_times(f"/{self.header.arms[0]}/state")
         return float(ns[-1] - ns[0]) * 1e-9 if len(ns) else 0.0
+
+    @property
+    def totals(self) -> Totals:
+        """As `totals_of`, but counted anew: reads all forces."""
+        tally, outcome = ForceTally(), self.outcome
+        columns = self.columns(*(f"{arm}/state" for arm in self.header.arms))
+        for arm in self.header.arms:
+            tally.add(columns[f"{arm}/state/wrench"][:, :3])
+        return Totals(
+            duration=self.duration,
+            peak_force=tally.peak,
+            mean_force=tally.mean,
+            cameras=self.cameras,
+            success=outcome.success,
+            progress=None if math.isnan(outcome.progress) else outcome.progress,
+            recovered=any(event.kind == "recovered" for event in self.events()),
+        )
 
     @property
     def cameras(self) -> tuple[str, ...]:

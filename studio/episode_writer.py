@@ -13,13 +13,16 @@ from typing import IO, Any
 import cv2
 import numpy as np
 
-from controller.types import Action, ArmState, Array, Image, Limit, Pose, Step
+from controller.types import ARM_ROW, Action, ArmState, Array, Image, Limit, Pose, Step
 from studio import schema
 from studio.edits import sync_folder
 from studio.episode import HEADER_TOPIC, METADATA, PART, Event, Header, Outcome, log_zero
 from studio.mcap_file import McapWriter
+from studio.totals import METADATA as TOTALS
+from studio.totals import ForceTally, Totals
 
 JPEG_QUALITY = 90
+FORCE = slice(ARM_ROW["wrench"].start, ARM_ROW["wrench"].start + 3)
 VIEW_PERIOD = 1 / 30  # [s] between messages for viewers
 
 Message = tuple[str, str, int, Any]  # topic, name of schema, log time [ns], message or its wire form
@@ -41,6 +44,8 @@ class EpisodeWriter:
         self._zero = log_zero(header.started)
         self._mcap = start_file(self._file, header.to_json(), self._zero)
         self._n_ticks = 0
+        self._forces = ForceTally()
+        self._begin = self._end = 0  # [ns] log times of the first state and the newest
         self._n_view = -1  # periods of the viewers that have begun
         self._shown: dict[str, float] = {}  # camera -> time of its newest image
         bases: list[Pose | None] = [Pose.from_vector(np.array(pose)) for pose in header.world_from_base]
@@ -53,9 +58,15 @@ class EpisodeWriter:
 
     def add(self, step: Step, wall: float) -> None:
         """Write one control period, told at the unix time `wall` [s], or raise and write none of it."""
-        messages = list(self._messages(step, wall))
+        traces = self._traces(step)
+        messages = list(self._messages(step, wall, traces))
         for message in messages:
             add_message(self._mcap, message, round(wall * 1e9))
+        for trace in traces:
+            self._forces.add(trace[..., FORCE])
+        if self._n_ticks == 0:
+            self._begin = self._log_time(float(traces[0][0, 0, 0]))
+        self._end = self._log_time(float(traces[-1][0, -1, 0]))
         self._n_ticks += 1
         self.time = float(step.applied.trace[0, -1, 0])
 
@@ -76,6 +87,7 @@ class EpisodeWriter:
         add_message(
             self._mcap, outcome_message(outcome, self.time, self._log_time(self.time)), time.time_ns()
         )
+        self._mcap.add_metadata(TOTALS, self._totals(outcome).to_entries())
         self._mcap.finish()
         put_in_place(self._file, self._part, self.path)
         self.close()
@@ -85,15 +97,32 @@ class EpisodeWriter:
         """Give up the file and its lock. A take that is not finished stays as `.part`, for `recover`."""
         self._file.close()
 
-    def _messages(self, step: Step, wall: float) -> Iterator[Message]:
+    def _totals(self, outcome: Outcome) -> Totals:
+        cameras = dict.fromkeys((*self.header.cameras, *self._shown))
+        return Totals(
+            duration=(self._end - self._begin) * 1e-9,
+            peak_force=self._forces.peak,
+            mean_force=self._forces.mean,
+            cameras=tuple(cameras),
+            success=outcome.success,
+            progress=None if math.isnan(outcome.progress) else outcome.progress,
+        )
+
+    def _traces(self, step: Step) -> list[Array]:
+        """The states to write, each (arms, n, ARM_ROW_WIDTH): with the very first, where none was yet."""
+        trace, arms = step.applied.trace, step.observation.arms
+        if self._n_ticks == 0 and len(arms) == len(trace) and trace[0, 0, 0] > step.observation.time:
+            return [np.stack([_row_of(state)[None] for state in arms]), trace]
+        return [trace]
+
+    def _messages(self, step: Step, wall: float, traces: list[Array]) -> Iterator[Message]:
         """Everything to write about a step, its tick last: recovery drops what has no tick."""
         arms, observation, now = self.header.arms, step.observation, step.observation.time
         if {len(observation.arms), len(step.requested.arms), len(step.applied.trace)} != {len(arms)}:
             raise ValueError(f"A step of {len(observation.arms)} arms in a take of {arms}.")
         ns = self._log_time(now)
-        if self._n_ticks == 0 and step.applied.trace[0, 0, 0] > now:  # the trace begins after the first state
-            yield from self._states(np.stack([_row_of(state)[None] for state in observation.arms]))
-        yield from self._states(step.applied.trace)
+        for trace in traces:
+            yield from self._states(trace)
         yield from self._actions(now, {"requested": step.requested, "applied": step.applied.action})
         yield from self._images(observation.images)
         if step.task_state is not None:

@@ -28,7 +28,7 @@ PAGE_CACHE = 64 * 1024  # [kiB]
 # Matches up to which collecting and sorting them beats walking a sorted index. `by_bucket` carries the start,
 # for any other order the rows themselves are read.
 FEW = {"started": 12_000}
-FEW_OTHERWISE = 2_000
+FEW_OTHERWISE = 1_200
 
 log = logging.getLogger(__name__)
 
@@ -144,11 +144,11 @@ class Index:
             raise ValueError(f"Cannot sort by {sort!r}; possible are {', '.join(SORTS)}.")
         if offset < 0 or (limit is not None and limit < 0):
             raise ValueError(f"A page needs limit and offset of 0 or more, not {limit} and {offset}.")
-        where, values = _where(filters)
+        index = self._best_index(filters, sort)
+        where, values = _where(filters, walks=index != "by_bucket")
         way = "DESC" if descending else "ASC"
         keys = dict.fromkeys((sort, "started", "bucket", "row"))  # the columns of the index, in its order
         order = ", ".join(f"{key} {way}" for key in keys)
-        index = self._best_index(filters, sort)
         page = f"SELECT row FROM episode INDEXED BY {index} WHERE {where} ORDER BY {order} LIMIT ? OFFSET ?"
         return self._select(
             f"row IN ({page}) ORDER BY {order}", [*values, -1 if limit is None else limit, offset]
@@ -360,10 +360,14 @@ END;
 # Filters as SQL: a condition, and values for its question marks.
 
 
-def _where(filters: Filters) -> tuple[str, list[Any]]:
-    """Of table episode."""
+def _where(filters: Filters, *, walks: bool = False) -> tuple[str, list[Any]]:
+    """Of table episode: the buckets that match, or with `walks` a look at the bucket of each row."""
     bucket, values = _where_bucket(filters)
-    parts = [f"bucket IN (SELECT bucket_id FROM bucket WHERE {bucket})" if values else "bucket IS NOT NULL"]
+    parts = ["bucket IS NOT NULL"]
+    if values and walks:
+        parts = [f"EXISTS (SELECT 1 FROM bucket WHERE bucket_id = episode.bucket AND {bucket})"]
+    elif values:
+        parts = [f"bucket IN (SELECT bucket_id FROM bucket WHERE {bucket})"]
     if (seed := filters.get("seed")) is not None:
         parts.append("seed = ?")
         values.append(seed)

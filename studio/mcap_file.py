@@ -48,6 +48,7 @@ RECORD_LIMIT = 256 * 1024 * 1024  # [bytes] a longer record is a damaged length
 _RECORD_HEAD = 9  # [bytes] opcode, length
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of (log time, offset) pairs
+_FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, starts of summary and of its offsets, CRC, magic
 _UNREADABLE = (McapError, struct.error, ValueError, RuntimeError)  # RuntimeError: of lz4
 
 
@@ -299,6 +300,37 @@ def _summary_of(path: Path, file: IO[bytes]) -> Any:
     if summary is None or not summary.chunk_indexes:
         raise EpisodeError(f"{path} is an MCAP file, but not a take of Studio: it has no chunks.")
     return summary
+
+
+def metadata_of(path: Path) -> dict[str, dict[str, str]]:
+    """The metadata records of a finished file by name, found without reading its index.
+
+    Empty for whatever is no finished file; `McapFile` says why.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        tail = os.pread(file.fileno(), _FOOTER.size, max(0, size - _FOOTER.size))
+        if len(tail) < _FOOTER.size or file.read(len(MAGIC)) != MAGIC:
+            return {}
+        opcode, _, start, _, _, magic = _FOOTER.unpack(tail)
+        if opcode != Opcode.FOOTER or magic != MAGIC or not 0 < start < size:
+            return {}
+        summary = os.pread(file.fileno(), size - start - _FOOTER.size, start)
+        found = {}
+        for index in _metadata_indexes(summary):
+            record = os.pread(file.fileno(), index.length, index.offset)[_RECORD_HEAD:]
+            found[index.name] = Metadata.read(ReadDataStream(io.BytesIO(record))).metadata
+        return found
+
+
+def _metadata_indexes(summary: bytes) -> Iterator[MetadataIndex]:
+    at = 0
+    while at + _RECORD_HEAD <= len(summary):
+        opcode, length = struct.unpack_from("<BQ", summary, at)
+        at += _RECORD_HEAD
+        if opcode == Opcode.METADATA_INDEX:
+            yield MetadataIndex.read(ReadDataStream(io.BytesIO(summary[at : at + length])))
+        at += length
 
 
 def read_until_torn(file: IO[bytes]) -> Iterator[McapRecord]:

@@ -30,7 +30,7 @@ from controller.types import (
 )
 from studio.catalog import FACETS, SORTS, Catalog, EpisodeRow, Filters, Summary, summarise
 from studio.edits import FLAGS, OUTCOMES, Edit, Segment, append, edits_path, read
-from studio.episode import Header, Outcome
+from studio.episode import Header, Outcome, open_episode, totals_of
 from studio.episode_writer import EpisodeWriter
 
 OUTCOME_OF = {True: "success", False: "failure", None: "unmarked"}
@@ -579,3 +579,35 @@ def test_processes_that_share_a_folder_lose_nothing_and_agree(data: Path) -> Non
         before = [dataclasses.asdict(row) for row in catalog.episodes(limit=None)]
         catalog.rebuild()
         assert [dataclasses.asdict(row) for row in catalog.episodes(limit=None)] == before
+
+
+# What the recorder sums up while it writes.
+
+
+def test_what_is_summed_up_while_recording_is_what_is_counted_afterwards(data: Path) -> None:
+    forces = (0.0, 0.5, 3.0, 5.0, math.nan, 2.0)
+    for path in (
+        record(data, "take-1", forces, cameras={"front": (8, 6)}),
+        record(data, "take-2", (math.nan,), success=None),
+        record(data, "take-3", ()),
+    ):
+        summed = totals_of(path)
+        assert summed is not None
+        with open_episode(path) as episode:
+            counted = episode.totals
+            assert summed[0] == episode.header
+        assert summed[1] == dataclasses.replace(
+            counted,
+            mean_force=pytest.approx(counted.mean_force, rel=1e-12),
+            duration=pytest.approx(counted.duration, abs=1e-9),
+        )
+
+
+def test_an_older_take_without_sums_is_read_whole(data: Path) -> None:
+    path = record(data, "take-1", (3.0, 5.0))
+    summed = summarise(path)
+    old = path.read_bytes().replace(b'{"duration"', b'{"durat1on"')
+    assert old != path.read_bytes()
+    path.write_bytes(old)
+    assert totals_of(path) is None
+    assert dataclasses.replace(summarise(path), duration=summed.duration) == summed

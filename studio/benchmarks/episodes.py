@@ -46,7 +46,7 @@ def measure(seconds: float = 60.0, recorded: float = 5.0) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         share = _recorder_share(Path(folder), recorded)
         path = Path(folder) / "read.mcap"
-        _write(path, seconds)
+        write_take(path, made_up_header(), seconds)
         columns = [_columns_cpu(path) for _ in range(3)]
         with open_episode(path) as episode:
             frames = _frame_times(episode, n=100)
@@ -142,9 +142,8 @@ def _recorder_share(folder: Path, seconds: float) -> float:
         return (time.process_time() - time.thread_time() - busy) / elapsed
 
 
-def _write(path: Path, seconds: float) -> None:
+def write_take(path: Path, header: Header, seconds: float) -> None:
     """With chunks of the size that a recorder makes."""
-    header = made_up_header()
     writer = EpisodeWriter(path, header)
     for number, step in enumerate(made_up_steps(round(seconds / CONTROL_PERIOD), header)):
         writer.add(step, time.time())

@@ -1,0 +1,156 @@
+"""How fast a large catalogue answers, also right after an edit, and how fast its index is built anew."""
+
+from __future__ import annotations
+
+import random
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import cycle
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from studio.benchmarks.episodes import made_up_header, write_take
+from studio.catalog import Catalog
+from studio.edits import FLAGS, OUTCOMES
+from studio.index import EpisodeRow, Index, Stamps, Summary
+
+ROWS, TAKES = 100_000, 1_000
+REPEATS = 15
+TASKS = ("bimanual-wiping", "drawing", "peg-cuboid", "peg-cylinder", "pick-insert", "wiping")
+WORDS = ("slips", "clean", "stroke", "late", "contact", "edge", "tilted", "slow", "again", "perfect")
+HEAD, TAIL = 64 * 1024, 1024 * 1024  # [bytes] of a take in which its header and its index are
+FILTERS: tuple[dict[str, Any], ...] = (
+    {},
+    {"task": "wiping"},
+    {"operator": "person 3", "outcome": "failure"},
+    {"task": "drawing", "min_quality": 4, "flags": ["jittery"]},
+    {"seed": 17},
+)
+TEXTS = ("slips", "clean stroke", "person 7", "tilt", "perfect wiping")
+SORTS = ("started", "peak_force", "quality", "episode_id")
+
+
+def measure(rows: int = ROWS, takes: int = TAKES) -> dict[str, float]:
+    """Medians [ms] of what a page asks of `rows` takes, also right after an edit; [s] to index `takes`."""
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder)
+        begin = time.perf_counter()
+        fill(data, rows)
+        results = {"fill_s": time.perf_counter() - begin}
+        results |= _answers(data)
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder)
+        _make_takes(data, takes)
+        with Catalog(data) as catalog:
+            catalog.refresh()
+            results["rebuild_s"] = _seconds(catalog.rebuild)
+            found = catalog.refresh()
+            assert catalog.count() == takes, found.unreadable
+    return results
+
+
+def fill(data_dir: Path, n: int) -> list[EpisodeRow]:
+    """An index of `n` made-up takes without any files; everything follows from their numbers."""
+    made = [made_up_row(data_dir, number) for number in range(n)]
+    index = Index(data_dir)
+    with index.transaction():
+        for row in made:
+            index.put(row, Stamps("made up", ""), (), in_trash=False)
+    index.close()
+    return made
+
+
+def made_up_row(data_dir: Path, number: int) -> EpisodeRow:
+    """What people of a large lab may have recorded: most takes succeed, and few are remarkable."""
+    rng = random.Random(number)
+    episode_id, task = f"take-{number:06d}", rng.choice(TASKS)
+    outcome = rng.choices(OUTCOMES, (75, 20, 5))[0]
+    n_flags = rng.choices((0, 1, 2), (85, 13, 2))[0]
+    return EpisodeRow(
+        episode_id=episode_id,
+        task=task,
+        instruction=f"do the {task}",
+        operator=f"person {rng.randrange(12)}",
+        agent=rng.choices(("gizmo", "xr", "scripted"), (30, 50, 20))[0],
+        seed=rng.randrange(1000),
+        started=1.7e9 + 40.0 * number,
+        duration=rng.uniform(5, 60),
+        arms=("right",),
+        cameras=("front", "right_wrist"),
+        recorded_success={"success": True, "failure": False}.get(outcome),
+        progress=rng.random(),
+        recovered=False,
+        peak_force=rng.uniform(0, 40),
+        mean_force=rng.uniform(0, 8),
+        outcome=outcome,
+        quality=rng.choices((None, 1, 2, 3, 4, 5), (50, 2, 5, 13, 20, 10))[0],
+        flags=tuple(sorted(rng.sample(FLAGS, n_flags))),
+        note=" ".join(rng.sample(WORDS, rng.randrange(4))),
+        trim=None,
+        edit_version=1,
+        path=data_dir / "episodes" / task / f"{episode_id}.mcap",
+        size=rng.randrange(10**6, 10**8),
+    )
+
+
+def _answers(data: Path) -> dict[str, float]:
+    def summary_of(path: Path) -> Summary:
+        return made_up_row(data, int(path.stem.removeprefix("take-")))
+
+    with Catalog(data, summary_of) as catalog:
+        sorts, texts, filters = cycle(SORTS), cycle(TEXTS), cycle(FILTERS)
+        asked: dict[str, Callable[[], object]] = {
+            "page_ms": lambda: catalog.episodes(sort=next(sorts), limit=50, **next(filters)),
+            "search_ms": lambda: catalog.episodes(text=next(texts), limit=50),
+            "facets_ms": lambda: catalog.facets(**next(filters)),
+        }
+        results: dict[str, float] = {}
+        for name, ask in asked.items():
+            times, after = [], []
+            for number in range(REPEATS):
+                ask()
+                times.append(_seconds(ask))
+                _edit(catalog, number)
+                after.append(_seconds(ask))
+            results |= {name: median(times) * 1e3, f"{name}_after_edit": median(after) * 1e3}
+            results[f"{name}_worst"] = max(times + after) * 1e3
+        return results
+
+
+def _edit(catalog: Catalog, number: int) -> None:
+    """Annotate one take, whose file is made for that."""
+    (row,) = catalog.episodes(limit=1, offset=37 * number)
+    row.path.parent.mkdir(parents=True, exist_ok=True)
+    row.path.touch()
+    catalog.annotate(row.episode_id, author="bench", quality=1 + number % 5, note=f"slips {number}")
+
+
+def _seconds(ask: Callable[[], object]) -> float:
+    """[s] of CPU time: others use the machine, too, and nothing waits for a disk here."""
+    begin = time.process_time()
+    ask()
+    return time.process_time() - begin
+
+
+def _make_takes(data: Path, n: int) -> None:
+    """Like takes of 60 s with two arms and three cameras, as far as an index reads them: both their ends."""
+    header = made_up_header()
+    original = data / "original.mcap"
+    write_take(original, header, 60.0)
+    size, old = original.stat().st_size, header.episode_id
+    folder = data / "episodes" / header.task
+    folder.mkdir(parents=True)
+    with original.open("rb") as file:
+        head = file.read(HEAD)
+        file.seek(size - TAIL)
+        tail = file.read()
+    for number in range(n):
+        new = f"{number:0{len(old)}d}"
+        with (folder / f"{new}.mcap").open("wb") as file:
+            file.write(head.replace(old.encode(), new.encode()))
+            file.truncate(size)
+            file.seek(size - TAIL)
+            file.write(tail)
+    original.unlink()
