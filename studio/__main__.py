@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from policy.config import PRESETS
-from studio.commands import dataset, machine, policies, recording, serving, takes
+from studio.commands import dataset, exchange, machine, policies, recording, serving, takes
 from studio.commands.terminal import complain
 
 COMMANDS: dict[str, Callable[..., int]] = {
@@ -36,6 +36,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "recover": takes.recover,
     "replay": takes.replay,
     "health": dataset.health,
+    "export": exchange.export,
     "collections": dataset.show_collections,
     "collection": dataset.collection,
     "steamvr": serving.steamvr,

@@ -17,6 +17,7 @@ import pytest
 from exported import names, record
 
 from controller.types import Stiffness, quaternion_from_rotation_vector, rotation_of
+from studio.__main__ import main
 from studio.api import DemoReport, Studio
 from studio.export import FORMATS, Cancelled, Format, Options, choose
 from studio.session import CONTROL_PERIOD
@@ -153,6 +154,53 @@ def test_an_earlier_version_of_the_edits_can_be_exported(tmp_path: Path) -> None
         assert (take.trim, take.edit_version) == ((0.1, 0.4), 1)
         with pytest.raises(ValueError, match="no version 3"):
             choose(studio.catalog, [first], {first: 3})
+
+
+# The command
+
+
+def run_studio(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+def test_the_command_exports_by_id_filter_or_collection(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = record(tmp_path, 0.2), record(tmp_path, 0.2, success=False)
+    with Studio(tmp_path) as studio:
+        studio.make_collection("both", author="ann", episode_ids=[second, first])
+        studio.annotate(first, author="ann", outcome="failure")
+    for number, (which, expected) in enumerate(
+        (
+            ([second], [second]),
+            (["--outcome", "failure"], [first, second]),
+            (["--collection", "both"], [second, first]),
+        )
+    ):
+        out = tmp_path / f"out-{number}"
+        options = ("--out", out, "--format", "act-hdf5", "--no-images", "--data", tmp_path, "--json")
+        assert run_studio("export", *which, *options) == 0
+        told = json.loads(capsys.readouterr().out.splitlines()[-1])
+        assert (told["episode_ids"], told["format"]) == (expected, "act-hdf5")
+        takes = json.loads((out / "takes.json").read_text())["takes"]
+    assert [take["outcome"] for take in takes] == ["failure", "success"]  # as they were in the collection
+
+
+def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    take = record(tmp_path, 0.2)
+    for arguments, status, told in (
+        ([], 2, "Say which takes"),
+        ([take, "--task", "made-up"], 2, "Say which takes"),
+        (["--task", "drawing"], 2, "No take is chosen"),
+        ([take, "--out", tmp_path], 1, "is not empty"),
+        ([take, "--rate", "0"], 2, "from 1 to 100 Hz"),
+    ):
+        out = () if "--out" in arguments else ("--out", tmp_path / "out")
+        assert run_studio("export", *arguments, *out, "--data", tmp_path) == status
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 # ACT HDF5

@@ -1,0 +1,92 @@
+"""Commands that give takes to other programs and take them from there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from studio.commands.terminal import DATA, Data, Json, console, print_json, progress
+
+PERCENT = 100
+
+
+def export(
+    ids: Positional[tuple[Annotated[str, arg(metavar="ID")], ...]] = (),
+    *,
+    out: Path,
+    format: Literal["lerobot", "act-hdf5", "rrd"] = "lerobot",
+    collection: str | None = None,
+    task: str | None = None,
+    operator: str | None = None,
+    agent: str | None = None,
+    outcome: Literal["success", "failure", "unmarked"] | None = None,
+    min_quality: int | None = None,
+    flags: tuple[str, ...] = (),
+    rate: float = 20.0,
+    actions: Literal["cartesian", "joints"] = "cartesian",
+    cameras: tuple[str, ...] | None = None,
+    images: bool = True,
+    pad: bool = True,
+    data: Data = DATA,
+    json: Json = False,
+) -> int:
+    """Write takes as a dataset or as Rerun recordings, all or nothing; Ctrl-C removes what was written.
+
+    Trims and outcomes are those of the takes' annotations; the file takes.json tells which.
+
+    Args:
+        ids: Takes to export, in this order; else all that match, the oldest first.
+        out: A new or empty folder.
+        format: lerobot (v3), act-hdf5 (the paper's layout), or rrd (Rerun).
+        collection: The takes of a collection, with the edits that they had then.
+        flags: All of these must be set.
+        rate: Rows a second of a dataset.
+        actions: Poses and stiffness, or the joints that plain ACT learns.
+        cameras: Only these.
+        images: Off leaves out all cameras.
+        pad: ACT files are as long as the longest, the last row repeated.
+    """
+    from studio.api import Studio
+    from studio.export import Options
+
+    options = Options(rate, actions, cameras if images else (), pad)
+    filters = (task, operator, agent, outcome, min_quality, *flags)
+    if sum((bool(ids), collection is not None, any(filters))) != 1:
+        raise ValueError("Say which takes: by their ids, as a --collection, or by a filter such as --task.")
+    with Studio(data) as studio:
+        if collection is not None:
+            members = studio.collection(collection).members
+            chosen = [member.episode_id for member in members]
+            versions = {member.episode_id: member.edit_version for member in members}
+        elif ids:
+            chosen, versions = list(ids), {}
+        else:
+            rows = studio.episodes(
+                task=task,
+                operator=operator,
+                agent=agent,
+                outcome=outcome,
+                min_quality=min_quality,
+                flags=flags or None,
+            )
+            chosen, versions = [row.episode_id for row in reversed(rows)], {}
+        with progress(f"{len(chosen)} takes", PERCENT, quiet=json) as advance:
+            shown = 0
+
+            def tell(share: float, what: str) -> None:
+                nonlocal shown
+                while shown < int(share * PERCENT):
+                    shown += 1
+                    advance()
+
+            done = studio.export(chosen, out, format, options, versions=versions, on_progress=tell)
+    if json:
+        print_json(done)
+        return 0
+    console.print(
+        f"{len(done.episode_ids)} takes, {done.seconds:.0f} s, {done.size / 1e6:.1f} MB in {done.folder}",
+        soft_wrap=True,
+    )
+    return 0
