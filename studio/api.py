@@ -23,6 +23,7 @@ from studio.collections import Change, Collection
 from studio.episode import Episode, open_episode
 from studio.evaluate import Plan, evaluate
 from studio.evaluation import Evaluation, Rollout, find
+from studio.export import imports
 from studio.health import TakeHealth
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
@@ -295,6 +296,24 @@ class Studio:
         """
         takes = exports.choose(self.catalog, episode_ids, versions)
         return exports.export(takes, form, Path(out), options, on_progress, cancel)
+
+    def import_takes(
+        self,
+        source: str | Path,
+        *,
+        task: str | None = None,
+        arms: Sequence[str] = (),
+        rate: float | None = None,
+        on_progress: Callable[[float, str], None] = lambda share, what: None,
+        cancel: threading.Event | None = None,
+    ) -> imports.Imported:
+        """Bring in takes of another data folder, a LeRobot v3 dataset, or ACT's HDF5 files.
+
+        `task` names what a dataset's takes show, `arms` and `rate` [Hz] are needed where it does not tell.
+        """
+        return imports.import_takes(
+            self.catalog, Path(source), task=task, arms=arms, rate=rate, tell=on_progress, cancel=cancel
+        )
 
     def replay(self, episode_id: str) -> replays.Replay:
         """Simulate a take again and compare it tick by tick."""

@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import fcntl
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -224,6 +225,34 @@ class Catalog:
             _move_edits(source, target)
             source.rename(target)
             return self._moved(source, target)
+
+    def adopt(self, source: Path) -> EpisodeRow:
+        """Copy a take of another data folder, with its sidecar, under its own id.
+
+        Raise FileExistsError where this folder has a take of that id, in the trash too.
+        """
+        summary = self._summarise(source)
+        if summary.episode_id != source.stem:
+            raise ValueError(f"{source} says that it is episode {summary.episode_id!r}; give it that name.")
+        with self._folder_lock():
+            known = self._index.by_id(summary.episode_id)
+            if known is not None and known.path.exists():
+                where = "in the trash" if self._is_in_trash(known.path) else f"at {known.path}"
+                raise FileExistsError(f"Episode {summary.episode_id} is here already, {where}.")
+            target = self._place(source, "episodes")
+            draft = target.with_name(f"{target.name}.copy")
+            try:
+                shutil.copyfile(source, draft)
+                with draft.open("rb") as file:
+                    os.fsync(file.fileno())
+                if edits_path(source).exists():
+                    edits.merge(edits_path(source), edits_path(target))
+                draft.rename(target)
+            except BaseException:
+                draft.unlink(missing_ok=True)
+                raise
+            sync_folder(target.parent)
+        return self.add(target)
 
     # The index and the files.
 

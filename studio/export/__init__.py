@@ -1,6 +1,6 @@
 """Takes for other programs: datasets to learn from, recordings to look at. One file for each format.
 
-Each has `write(takes, folder, options, progress)`, and those that can be read again `find` and `read`.
+Each has `write(takes, folder, options, progress)`; what can be read again, `studio.export.imports` reads.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ import numpy as np
 from controller.types import Array
 from studio.export import arrays
 from studio.export.folder import Progress
+from studio.export.rebuild import ArmRows, Rows, known_headers
 from studio.export.source import Grid, Take, cameras_of, opened
 
 if TYPE_CHECKING:
@@ -179,3 +180,121 @@ def _pad(file: h5py.File, longest: int, sink: _Sink) -> None:
                 sink.check()
 
     file.visititems(lengthen)
+
+
+def read(source: Path, arms: tuple[str, ...], rate: float | None) -> tuple[int, Iterator[Rows]]:
+    """How many takes there are, and the takes. `source` is a folder or one file.
+
+    Raises ValueError, telling what was found, where a file does not have ACT's layout.
+    """
+    files = [source] if source.is_file() else sorted(source.glob("episode_*.hdf5"), key=_number)
+    headers = known_headers(files[0].parent)
+    return len(files), (_read(path, arms, rate, headers) for path in files)
+
+
+def _number(path: Path) -> tuple[int, str]:
+    digits = path.stem.removeprefix("episode_")
+    return (int(digits) if digits.isdigit() else -1, path.stem)
+
+
+def _read(
+    path: Path, arms: tuple[str, ...], rate: float | None, headers: Mapping[str, Mapping[str, Any]]
+) -> Rows:
+    try:
+        opened_file = h5py.File(path)
+    except OSError as error:
+        raise ValueError(f"{path} is no HDF5 file, or damaged: {error}.") from error
+    with opened_file as file:
+        told = dict(file.attrs)
+        if "observations/qpos" not in file:
+            raise ValueError(f"{path} has no /observations/qpos; it has {_datasets(file)}.")
+        n = int(told.get("length", len(file["observations/qpos"])))
+        known = {name: file[name][:n] for name in _datasets(file) if "/images/" not in name}
+        sizes = {name: item.shape for name, item in file.get("observations/images", {}).items()}
+    rate = float(told.get("control_frequency", rate or 0.0))
+    if rate <= 0:
+        raise ValueError(f"{path} does not tell its rate; give it (ACT's own datasets have 50 Hz).")
+    width = known["observations/qpos"].shape[1]
+    names = _arm_names(path, width, arms or tuple(map(str, told.get("arms", ()))))
+    columns = {arm: _arm(known, index, len(names)) for index, arm in enumerate(names)}
+    cameras = {name: (shape[2], shape[1]) for name, shape in sizes.items() if len(shape) == 4}
+    read_all = set().union(*(used for _, used in columns.values()))
+    encoded = {f"observations/images/{name}" for name in sizes.keys() - cameras}  # no pixels
+    outcome = told.get("outcome")
+    return Rows(
+        name=str(told.get("episode_id", path.stem)),
+        rate=rate,
+        arms={arm: ArmRows.of(n, **found) for arm, (found, _) in columns.items()},
+        cameras=cameras,
+        images=_pictures(path, n, cameras),
+        instruction=str(told.get("instruction", "")),
+        task=str(told["task"]) if "task" in told else None,
+        success={"success": True, "failure": False}.get(str(outcome)),
+        header=headers.get(str(told.get("episode_id"))),
+        left_out=tuple(sorted({*known, *encoded} - read_all)),
+    )
+
+
+def _datasets(file: h5py.File) -> list[str]:
+    found: list[str] = []
+
+    def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            found.append(name)
+
+    file.visititems(note)
+    return found
+
+
+def _arm_names(path: Path, width: int, arms: tuple[str, ...]) -> tuple[str, ...]:
+    usual = {7: ("right",), 14: ("left", "right")}
+    names = arms or usual.get(width, ())
+    if not names or width != 7 * len(names):
+        raise ValueError(
+            f"{path} has {width} joint positions; ACT has 7 for each arm (6 joints and the gripper), which "
+            f"does not fit the arms {list(names)}."
+        )
+    return names
+
+
+def _arm(known: Mapping[str, Array], index: int, n_arms: int) -> tuple[dict[str, Array], set[str]]:
+    """One arm's columns, and the datasets that they come from."""
+    found: dict[str, Array] = {}
+    used: set[str] = set()
+
+    def part(name: str, width: int) -> Array | None:
+        values = known.get(name)
+        if values is None or values.ndim != 2 or values.shape[1] != width * n_arms:
+            return None
+        used.add(name)
+        return np.asarray(values[:, width * index : width * (index + 1)], float)
+
+    qpos, qvel, tcp = (part(f"observations/{name}", 7) for name in ("qpos", "qvel", "eef_pos"))
+    assert qpos is not None
+    found |= {"q": qpos[:, :6], "gripper": qpos[:, 6]}
+    if qvel is not None:
+        found["dq"] = qvel[:, :6]
+    if tcp is not None:
+        found["base_from_tcp"] = _pose(tcp[:, :3], tcp[:, 3:6])
+    for name, column in (("ft", "wrench"), ("q_command", "q_command")):
+        if (values := part(f"observations/{name}", 6)) is not None:
+            found[column] = values
+    if (action := part("action", 19)) is not None:
+        found["stiffness"] = arrays.stiffness_from(action[:, :12])
+        found |= {"base_from_target": _pose(action[:, 12:15], action[:, 15:18]), "opening": action[:, 18]}
+    elif (action := part("action", 7)) is not None:
+        found |= {"q_target": action[:, :6], "opening": action[:, 6]}
+    return found, used
+
+
+def _pose(position: Array, axis_angle: Array) -> Array:
+    return np.concatenate((position, arrays.quaternions_from_axis_angle(axis_angle)), axis=1)
+
+
+def _pictures(path: Path, n: int, cameras: Mapping[str, Any]) -> Iterator[dict[str, Array]]:
+    with h5py.File(path) as file:
+        for row in range(n):
+            yield {
+                name: np.asarray(file[f"observations/images/{name}"][row]).astype(np.uint8)
+                for name in cameras
+            }
