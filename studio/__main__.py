@@ -37,6 +37,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "replay": takes.replay,
     "health": dataset.health,
     "export": exchange.export,
+    "import": exchange.import_takes,
     "collections": dataset.show_collections,
     "collection": dataset.collection,
     "steamvr": serving.steamvr,

@@ -14,6 +14,7 @@ from exported import names, record
 
 from controller.types import Array, rotation_of
 from studio import edits
+from studio.__main__ import main
 from studio.api import Studio
 from studio.cursor import Cursor
 from studio.episode import Episode
@@ -241,3 +242,15 @@ def test_a_take_that_cannot_be_read_does_not_stop_the_others(tmp_path: Path) -> 
         assert imported.episode_ids == (good,)
         assert "is torn" in imported.refused[torn]
         assert "says that it is episode" in imported.refused["renamed"]
+
+
+def test_the_command_imports_and_tells_what_it_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    take = record(tmp_path / "a", 0.2, cameras=())
+    for status, ids, refused in ((0, [take], []), (1, [], [take])):
+        with pytest.raises(SystemExit) as ended:
+            main(["import", str(tmp_path / "a"), "--data", str(tmp_path / "b"), "--json"])
+        told = json.loads(capsys.readouterr().out.splitlines()[-1])
+        assert (ended.value.code, told["episode_ids"], list(told["refused"])) == (status, ids, refused)
+        assert told["source"] == "studio"

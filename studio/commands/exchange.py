@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -72,21 +74,65 @@ def export(
                 flags=flags or None,
             )
             chosen, versions = [row.episode_id for row in reversed(rows)], {}
-        with progress(f"{len(chosen)} takes", PERCENT, quiet=json) as advance:
-            shown = 0
-
-            def tell(share: float, what: str) -> None:
-                nonlocal shown
-                while shown < int(share * PERCENT):
-                    shown += 1
-                    advance()
-
+        with _percents(_takes(chosen), quiet=json) as tell:
             done = studio.export(chosen, out, format, options, versions=versions, on_progress=tell)
     if json:
         print_json(done)
         return 0
     console.print(
-        f"{len(done.episode_ids)} takes, {done.seconds:.0f} s, {done.size / 1e6:.1f} MB in {done.folder}",
+        f"{_takes(done.episode_ids)}, {done.seconds:.0f} s, {done.size / 1e6:.1f} MB in {done.folder}",
         soft_wrap=True,
     )
     return 0
+
+
+def import_takes(
+    source: Positional[Annotated[Path, arg(metavar="PATH")]],
+    task: str | None = None,
+    arms: tuple[str, ...] = (),
+    rate: float | None = None,
+    data: Data = DATA,
+    json: Json = False,
+) -> int:
+    """Bring in takes of another data folder, of a LeRobot v3 dataset, or of ACT's HDF5 files.
+
+    Takes of a data folder keep their ids and annotations; those that are here already are refused.
+
+    Args:
+        source: The folder, or one HDF5 file.
+        task: What a dataset's takes show, where it does not tell.
+        arms: Of a dataset that does not name its numbers, left to right.
+        rate: Rows a second, where a dataset does not tell.
+    """
+    from studio.api import Studio
+
+    with Studio(data) as studio, _percents(f"{source.name}", quiet=json) as tell:
+        found = studio.import_takes(source, task=task, arms=arms, rate=rate, on_progress=tell)
+    if json:
+        print_json(found)
+        return int(bool(found.refused))
+    console.print(f"{_takes(found.episode_ids)} from {found.source} to {data}", soft_wrap=True)
+    for why in found.refused.values():
+        console.print(f"  refused: {why}", style="yellow", soft_wrap=True)
+    for column in found.left_out:
+        console.print(f"  left out: {column}", style="yellow", soft_wrap=True)
+    return int(bool(found.refused))
+
+
+def _takes(names: Sequence[str]) -> str:
+    return f"{len(names)} take{'' if len(names) == 1 else 's'}"
+
+
+@contextmanager
+def _percents(what: str, quiet: bool) -> Iterator[Callable[[float, str], None]]:
+    """A progress bar for what tells its share, 0..1."""
+    with progress(what, PERCENT, quiet=quiet) as advance:
+        shown = 0
+
+        def tell(share: float, name: str) -> None:
+            nonlocal shown
+            while shown < int(share * PERCENT):
+                shown += 1
+                advance()
+
+        yield tell
