@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from exported import names, record
 
-from controller.types import Stiffness, quaternion_from_rotation_vector, rotation_of
+from controller.types import JointTarget, Stiffness, quaternion_from_rotation_vector, rotation_of
 from studio.__main__ import main
 from studio.api import DemoReport, Studio
 from studio.export import FORMATS, Cancelled, Format, Options, choose
@@ -273,6 +273,19 @@ def test_trims_cut_an_export_to_the_row(tmp_path: Path) -> None:
             q = episode.columns("right/state")["right/state/q"][125:251:25].astype(np.float32)
             assert np.array_equal(file["observations/qpos"][:, :6], q)  # 0.25 s to 0.5 s: six rows
             assert np.array_equal(file["observations/images/front"][0], episode.image("front", 5))
+
+
+def test_a_take_without_targets_is_refused_with_what_helps(tmp_path: Path) -> None:
+    joints = record(tmp_path, 0.3, cameras=(), action=JointTarget(np.zeros(6)))
+    with Studio(tmp_path) as studio:
+        with pytest.raises(ValueError, match=r"follows no Cartesian target for 100% of its time.*as joints"):
+            studio.export([joints], tmp_path / "out", "act-hdf5")
+        studio.export([joints], tmp_path / "out", "act-hdf5", Options(control="joints"))
+        with h5py.File(tmp_path / "out" / "episode_0.hdf5") as file:
+            assert not file["action"][:, :6].any()  # the joints that were asked for
+        studio.annotate(joints, author="ann", trim=(0.1, 0.12))
+        with pytest.raises(ValueError, match="fewer than two rows at 20 Hz within its trim"):
+            studio.export([joints], tmp_path / "two", "act-hdf5", Options(control="joints"))
 
 
 def test_joint_actions_are_what_the_servo_commanded_next(studio: Studio, tmp_path: Path) -> None:

@@ -139,8 +139,9 @@ class Grid:
         return np.asarray(self._columns[f"{arm}/applied/{name}"][self._action])
 
     def commanded(self, arm: str) -> Array:
-        """(n, 6) [rad] the joints that the control period which begins then commanded."""
-        return np.asarray(self._columns[f"{arm}/state/q_command"][self._after])
+        """(n, 6) [rad] the joints asked for; where none were, those that the period then commanded."""
+        asked, command = self.action(arm, "q"), self._columns[f"{arm}/state/q_command"][self._after]
+        return np.where(np.isfinite(asked), asked, command)
 
     def image_numbers(self, camera: str) -> Array:
         """(n,) which image of a camera shows each moment."""
