@@ -22,7 +22,7 @@ from studio.catalog import Catalog, Refreshed
 from studio.collections import Change, Collection
 from studio.episode import Episode, open_episode
 from studio.evaluate import Plan, evaluate
-from studio.evaluation import Evaluation, Rollout, find
+from studio.evaluation import Evaluation, Rollout, find, load_all
 from studio.export import imports
 from studio.health import TakeHealth
 from studio.index import EpisodeRow, Filters
@@ -190,6 +190,10 @@ class Studio:
     def evaluation(self, name: str, task: str | None = None) -> Evaluation:
         """By path, by id, or the newest of an agent."""
         return find(self.data_dir, name, task)
+
+    def evaluations(self) -> list[Evaluation]:
+        """The newest first."""
+        return load_all(self.data_dir)
 
     # Takes
 

@@ -137,19 +137,23 @@ def load(path: Path) -> Evaluation:
         raise ValueError(f"{path} is no evaluation: {error}.") from error
 
 
+def load_all(data_dir: Path) -> list[Evaluation]:
+    """Those of a data folder, the newest first."""
+    paths = _path(data_dir, "").parent.glob("*.json")
+    return sorted((load(path) for path in paths), key=lambda evaluation: -evaluation.started)
+
+
 def find(data_dir: Path, name: str, task: str | None = None) -> Evaluation:
     """By path, by id, or the newest of the agent `name` (on `task`, where it is given)."""
     for path in (Path(name), _path(data_dir, name)):
         if path.suffix == ".json" and path.is_file():
             return load(path)
-    saved = sorted(
-        (load(path) for path in _path(data_dir, "").parent.glob("*.json")), key=lambda e: e.started
-    )
+    saved = load_all(data_dir)
     found = [e for e in saved if e.run == name and task in (None, e.task)]
     if not found:
         there = sorted({f"{e.run} on {e.task}" for e in saved}) or "none yet; studio evaluate makes them"
         raise KeyError(f"No evaluation of {name!r}{f' on {task}' if task else ''}; there are {there}.")
-    return found[-1]
+    return found[0]
 
 
 def _path(data_dir: Path, evaluation_id: str) -> Path:

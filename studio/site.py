@@ -21,6 +21,7 @@ from studio.api import Studio
 from studio.cert import Certificate
 from studio.door import person_of
 from studio.headset import add_xr
+from studio.http import add_api
 from studio.server import FrontServer, is_loopback, make_app, start_viser
 from studio.ui.app import Page, SessionProcess
 from studio.ui.gate import Gate
@@ -88,6 +89,7 @@ def open_site(
             reception=gate.receive,
         )
         add_xr(app, page.remote, lambda socket: gate.lease.sit(person_of(socket), "headset"), page.model)
+        stack.callback(add_api(app, studio, page.remote, gate.lease).close)
         front = FrontServer(app, host, port, token=token, certificate=certificate)
         stack.enter_context(front)
         yield Site(front, page, certificate)

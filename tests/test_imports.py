@@ -42,7 +42,10 @@ LAYERS = (
         *("references", "evaluation", "evaluate", "report", "probes", "health", "survey", "collections"),
     ),
     ("api",),
-    ("server", "site", "headset", "ui", "serve", "commands", "__main__"),
+    (
+        *("server", "site", "headset", "http", "http_takes", "http_wire", "reading", "ui", "serve"),
+        *("commands", "client", "__main__"),
+    ),
 )
 SKINS = len(LAYERS) - 1
 

@@ -1,0 +1,87 @@
+"""A process that reads takes for the web process, which carries the hands of those who drive."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import msgspec
+import numpy as np
+
+from controller.types import Array
+from studio.episode import open_episode
+
+NICE = 5  # behind whatever serves people
+ORPHAN = 2.0  # [s] between looks whether the web process still is
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Reader:
+    """Runs functions of modules in one other process, which starts with the first. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pool: ProcessPoolExecutor | None = None
+
+    def read(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Wait for what `function` returns or raises; a process that died meanwhile is started once more."""
+        try:
+            return self._submit(function, *args, **kwargs).result()
+        except BrokenProcessPool:
+            self.close()
+            return self._submit(function, *args, **kwargs).result()
+
+    def close(self) -> None:
+        """End the process; the next call starts another."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+
+    def _submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        with self._lock:
+            if self._pool is None:
+                self._pool = ProcessPoolExecutor(1, get_context("spawn"), _prepare, (os.getpid(),))
+            return self._pool.submit(function, *args, **kwargs)
+
+
+def columns_npz(path: Path, groups: tuple[str, ...], every: int) -> bytes:
+    """Columns as `Episode.columns` names them, each `every`-th row, as NumPy's archive."""
+    file = io.BytesIO()
+    np.savez(file, **_columns(path, groups, every))  # type: ignore[arg-type]
+    return file.getvalue()
+
+
+def columns_json(path: Path, groups: tuple[str, ...], every: int) -> bytes:
+    """The same as lists; NaN becomes null."""
+    columns = _columns(path, groups, every)
+    return msgspec.json.encode({name: column.tolist() for name, column in columns.items()})
+
+
+def _columns(path: Path, groups: tuple[str, ...], every: int) -> dict[str, Array]:
+    with open_episode(path) as episode:
+        return {name: column[::every] for name, column in episode.columns(*groups).items()}
+
+
+def _prepare(parent: int) -> None:
+    """Of the process: it gives way, leaves Ctrl-C to the web process, and ends with it."""
+    os.nice(NICE)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(ORPHAN)
+    os._exit(0)
