@@ -194,7 +194,11 @@ class Rig:
         return self.process.session
 
     def visitor(self) -> Visitor:
-        return Visitor(self.front.port)
+        """Whom the page knows: before, it could tell nothing to this one alone."""
+        known = set(self.server.get_clients())
+        visitor = Visitor(self.front.port)
+        wait_for(lambda: self.server.get_clients().keys() - known)
+        return visitor
 
     def close(self) -> None:
         self.page.close()
