@@ -14,7 +14,8 @@ from exported import record
 
 from controller.types import Array, Stiffness, rotation_of
 from studio.api import Studio
-from studio.export import Options, lerobot
+from studio.export import Options, lerobot, statistics
+from studio.export.video import VideoWriter
 
 ARMS = ("left", "right")
 
@@ -204,7 +205,17 @@ def test_files_roll_over_when_they_are_full(tmp_path: Path, monkeypatch: pytest.
         assert set(rows["episode_index"].tolist()) == {number}
 
 
+def test_a_dead_sensor_spoils_no_statistics() -> None:
+    values = np.array([[1.0, np.nan], [3.0, np.nan], [np.inf, np.nan]])
+    found = statistics.of_numbers(values)
+    assert found["mean"].tolist() == [2.0, 0.0]
+    assert found["max"].tolist() == [3.0, 0.0]
+    json.dumps({name: value.tolist() for name, value in found.items()}, allow_nan=False)
+
+
 def test_what_lerobot_cannot_hold_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="even width and height, not 321 x 240"):
+        VideoWriter(tmp_path / "odd.mp4", 20, 321, 240)
     take = record(tmp_path, 0.3)
     with Studio(tmp_path) as studio, pytest.raises(ValueError, match="whole number of rows"):
         studio.export([take], tmp_path / "out", "lerobot", Options(rate=12.5))

@@ -7,8 +7,10 @@ import shutil
 import threading
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from exported import names, record
 
@@ -72,8 +74,6 @@ def assert_same_numbers(before: Path, after: Path, form: Format) -> None:
                     assert np.allclose(a["observations"][key], b["observations"][key], atol=1e-5)
                 assert np.allclose(a["action"], b["action"], atol=1e-4)
         return
-    import pyarrow.parquet as pq
-
     path = "data/chunk-000/file-000.parquet"
     a, b = (pq.read_table(folder / path).to_pydict() for folder in (before, after))
     assert a.keys() == b.keys()
@@ -183,6 +183,26 @@ def test_lerobot_datasets_of_others_need_to_be_told_their_arms(tmp_path: Path) -
         renamed_version(tmp_path / "out", "v2.1")
         with pytest.raises(ValueError, match=r"a LeRobot dataset v2\.1; v3\.0 can be read"):
             other.import_takes(tmp_path / "out", task="push")
+
+
+def test_lerobot_datasets_may_keep_pictures_in_their_table(tmp_path: Path) -> None:
+    take = record(tmp_path / "a", 0.3, cameras=("front",))
+    out = tmp_path / "out"
+    with Studio(tmp_path / "a") as studio, Studio(tmp_path / "b") as other:
+        studio.export([take], out, "lerobot", Options(cameras=()))
+        with studio.open(take) as before:
+            pixels = [before.image("front", row) for row in range(6)]
+        encoded = [cv2.imencode(".png", picture[..., ::-1])[1].tobytes() for picture in pixels]
+        path = out / "data" / "chunk-000" / "file-000.parquet"
+        cells = [{"bytes": png, "path": None} for png in encoded]
+        pq.write_table(pq.read_table(path).append_column("observation.images.front", [cells]), path)
+        told = json.loads((out / "meta" / "info.json").read_text())
+        told["features"]["observation.images.front"] = {"dtype": "image", "shape": [240, 320, 3]}
+        (out / "meta" / "info.json").write_text(json.dumps(told))
+        (again,) = other.import_takes(out).episode_ids
+        with other.open(again) as after:
+            for row, picture in enumerate(pixels):
+                assert np.abs(picture.astype(int) - after.image("front", row)).mean() < 6  # of 255: JPEG
 
 
 def renamed_version(out: Path, version: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -57,7 +58,7 @@ def choose(
     catalog: Catalog, episode_ids: Sequence[str], versions: Mapping[str, int] | None = None
 ) -> list[Take]:
     """Takes by id as they are annotated now, or as a version of their edits told them."""
-    twice = sorted({name for name in episode_ids if list(episode_ids).count(name) > 1})
+    twice = sorted(name for name, count in Counter(episode_ids).items() if count > 1)
     if twice:
         raise ValueError(f"{', '.join(twice)} would be exported twice.")
     if not episode_ids:
