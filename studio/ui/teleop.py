@@ -141,7 +141,7 @@ class _PolicyRow:
     def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
         self._desk, self._looked = desk, -LOOK_EVERY
         self._task = ""
-        _columns(gui, 2)
+        self._row = _columns(gui, 2)
         self._run = gui.add_dropdown("Run", ("",), visible=False, hint="A trained policy of this task.")
         self._button = gui.add_button(LABELS["policy"], color=PASSIVE, visible=False)
 
@@ -159,7 +159,7 @@ class _PolicyRow:
         _set_active(self._button, LABELS["policy"], status.driver == "policy")
 
     def _offer(self, runs: tuple[str, ...]) -> None:
-        self._run.visible = self._button.visible = bool(runs)
+        self._row.visible = self._run.visible = self._button.visible = bool(runs)
         if runs and runs != self._run.options:
             chosen = self._run.value
             self._run.options = runs
@@ -336,9 +336,9 @@ def counter(status: Status) -> str:
     )
 
 
-def _columns(gui: viser.GuiApi, count: int) -> None:
-    """Put the next `count` widgets side by side; `web_assets/page.css` does it."""
-    gui.add_html(f'<i class="c{count}"></i>')
+def _columns(gui: viser.GuiApi, count: int) -> viser.GuiHtmlHandle:
+    """Put the next `count` widgets side by side; `web_assets/page.css` does it. Hide it where they are hidden."""
+    return gui.add_html(f'<i class="c{count}"></i>')
 
 
 def _set_active(button: viser.GuiButtonHandle, label: str, is_active: bool) -> None:
