@@ -337,7 +337,7 @@ def counter(status: Status) -> str:
 
 
 def _columns(gui: viser.GuiApi, count: int) -> viser.GuiHtmlHandle:
-    """Put the next `count` widgets side by side; `web_assets/page.css` does it. Hide it where they are hidden."""
+    """Put the next `count` widgets side by side (`web_assets/page.css`); hidden with them."""
     return gui.add_html(f'<i class="c{count}"></i>')
 
 
