@@ -61,7 +61,9 @@ def check(catalog: Catalog, rows: list[EpisodeRow]) -> None:
         assert catalog.count(text=text) == sum(says(row, text) for row in rows)
 
 
-@pytest.mark.parametrize("n", [2_000, pytest.param(ROWS, marks=pytest.mark.verify)])
+@pytest.mark.parametrize(
+    "n", [2_000, pytest.param(ROWS, marks=[pytest.mark.verify, pytest.mark.timeout(1200)])]
+)
 def test_a_large_catalogue_says_what_its_rows_say(tmp_path: Path, n: int) -> None:
     rows = fill(tmp_path, n)
     with Catalog(tmp_path, summary_of(tmp_path)) as catalog:
