@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import viser
+from visitor import wait_for
 
 from controller.types import Array, Pose, Wrench
 from studio import meshes
@@ -362,6 +363,7 @@ def test_the_stage_looks_at_the_work(model: SceneModel, server: viser.ViserServe
 def test_whoever_came_before_the_stage_looks_at_it_too(
     model: SceneModel, server: viser.ViserServer, viewer: Viewer
 ) -> None:
+    wait_for(server.get_clients)
     set_stage(server, model)
     viewer.settle()
     (sent,) = [m["look_at"] for m in viewer.messages if m["type"] == "SetCameraLookAtMessage"]
