@@ -366,7 +366,7 @@ def test_whoever_came_before_the_stage_looks_at_it_too(
     wait_for(server.get_clients)
     set_stage(server, model)
     viewer.settle()
-    (sent,) = [m["look_at"] for m in viewer.messages if m["type"] == "SetCameraLookAtMessage"]
+    *_, sent = [m["look_at"] for m in viewer.messages if m["type"] == "SetCameraLookAtMessage"]
     assert sent == pytest.approx(server.initial_camera.look_at)
 
 
