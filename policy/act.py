@@ -76,6 +76,7 @@ class Act(nn.Module):
         self.n_cameras = n_cameras if config.images else 0
         self.has_wrench, self.has_cvae = config.wrench, config.cvae
         self.latent, self.kl_weight = config.latent, config.kl_weight
+        self.state_dropout = config.state_dropout
         self._groups: dict[Group, list[int]] = {name: encoding.columns(name) for name in encoding.groups}
         n_wrench = encoding.n_arms * 6
 
@@ -146,7 +147,10 @@ class Act(nn.Module):
     def _actions(
         self, batch: Batch, latent: Tensor, hide_images: bool = False, hide_wrench: bool = False
     ) -> Tensor:
-        tokens = [self.state_token(batch.state)[:, None]]
+        state = batch.state
+        if self.training and self.state_dropout:
+            state = state * (torch.rand(len(state), 1, device=state.device) >= self.state_dropout)
+        tokens = [self.state_token(state)[:, None]]
         if self.has_wrench:
             tokens.append(self.wrench_tokens(batch.wrench * (not hide_wrench)))
         if self.has_cvae:

@@ -55,6 +55,8 @@ class TrainConfig:
     decoder_layers: int = 2
     pre_norm: bool = True
     dropout: float = 0.1
+    state_dropout: float = 0.0
+    """Share of the samples that are learned without the arm's state, so that images have to tell."""
     cvae: bool = False
     """Learn a latent for what the observation does not tell; zero when the policy runs."""
     cvae_layers: int = 2
@@ -110,7 +112,7 @@ class TrainConfig:
         for name in ("warm_up", "shift", "threads", "weight_decay", "kl_weight", *_WEIGHTS):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{_flag(name)} must not be negative, but is {getattr(self, name)}.")
-        for name in ("dropout", "ema", "validation", "brightness"):
+        for name in ("dropout", "state_dropout", "ema", "validation", "brightness"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{_flag(name)} must be at least 0 and below 1, not {getattr(self, name)}.")
         if self.width % self.heads or self.width % 4:

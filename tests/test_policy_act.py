@@ -193,3 +193,20 @@ def test_half_precision_gives_nearly_the_same_loss_in_whole_precision() -> None:
             losses.append(model.loss(batch)["loss"])
     assert losses[1].dtype == torch.float32
     assert losses[1].item() == pytest.approx(losses[0].item(), rel=0.02)
+
+
+def test_a_share_of_the_samples_is_learned_without_the_state() -> None:
+    model, encoding = built(dataclasses.replace(TINY, state_dropout=0.5, images=False))
+    torch.manual_seed(1)
+    n, config = 64, TINY
+    wrench, images = torch.randn(n, config.wrench_history, 6), torch.zeros(n, 0, 1, 1, 3)
+    told = []
+    for _ in range(2):
+        batch = Batch(torch.randn(n, encoding.state_width), wrench, images)
+        torch.manual_seed(2)
+        told.append(model(batch))
+    same = torch.isclose(*told, atol=1e-6).all((1, 2)).sum().item()
+    assert 16 < same < 48
+    model.eval()
+    batch, other = (Batch(torch.randn(n, encoding.state_width), wrench, images) for _ in range(2))
+    assert not torch.isclose(model(batch), model(other), atol=1e-6).all((1, 2)).any()
