@@ -28,6 +28,7 @@ from studio.door import person_of
 from studio.http_takes import takes_router
 from studio.http_wire import Body, Name, Problem, TaskInfo, as_json, refusals, schema_of
 from studio.lease import Lease, NotDriving, PersonId, Seat
+from studio.pages import add_pages
 from studio.reading import Reader
 from studio.ui.remote import Remote
 
@@ -100,11 +101,12 @@ class ControlIn(Body):
 
 
 def add_api(app: FastAPI, studio: Studio, remote: Remote, lease: Lease) -> Reader:
-    """Mount the routes; close the reader that is returned when the server has ended."""
+    """Mount the routes and our pages; close the reader that is returned when the server has ended."""
     reader = Reader()
     app.include_router(_session_router(remote, lease), prefix="/api/v1")
     app.include_router(takes_router(studio, remote, reader), prefix="/api/v1")
     app.include_router(_studio_router(studio), prefix="/api/v1")
+    add_pages(app)
 
     @app.get("/api/docs", include_in_schema=False)
     async def show_docs() -> HTMLResponse:
