@@ -28,6 +28,7 @@ import numpy as np
 from controller.types import Array
 from studio.channels import Latest
 from studio.collections import Collection
+from studio.curves import Curves, Spread, Timeline
 from studio.http_wire import CollectionDetails, Details, Health, Page, TaskInfo
 from studio.index import EpisodeRow, Filters
 from studio.lease import Standing
@@ -129,6 +130,38 @@ class Client:
         content = self._ask("GET", f"{_take(episode_id)}/columns", params=asked).content
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             return dict(archive)
+
+    def table(self, episode_id: str, *groups: str, every: int = 1) -> Any:
+        """The same as a `pyarrow.Table`, for groups that have as many rows each."""
+        import pyarrow as pa
+
+        asked = {"group": list(groups), "every": every, "format": "arrow"}
+        content = self._ask("GET", f"{_take(episode_id)}/columns", params=asked).content
+        return pa.ipc.open_stream(content).read_all()
+
+    def timeline(self, episode_id: str) -> Timeline:
+        """Phases, stiffness modes, marks and the times of all images."""
+        return self._get(f"{_take(episode_id)}/timeline", Timeline)
+
+    def curves(
+        self,
+        episode_id: str,
+        *names: str,
+        points: int = 1000,
+        start: float | None = None,
+        end: float | None = None,
+    ) -> Curves:
+        """Curves such as "right/force", or all, between two times [s], enough for a plot `points` wide."""
+        asked = {"name": list(names), "points": points, "start": start, "end": end}
+        return self._get(f"{_take(episode_id)}/curves", Curves, **asked)
+
+    def spread(self, *episode_ids: str, align: Literal["start", "contact"] = "start") -> Spread:
+        """Mean and standard deviation over some takes."""
+        return self._get("/spread", Spread, episode_id=list(episode_ids), align=align)
+
+    def video(self, episode_id: str, camera: str) -> bytes:
+        """A film of one camera, H.264 at 20 Hz."""
+        return self._ask("GET", f"{_take(episode_id)}/video/{quote(camera, safe='')}.mp4").content
 
     def image_times(self, episode_id: str) -> dict[str, list[float]]:
         """[s] since the scene was reset, of each camera."""

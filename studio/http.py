@@ -26,6 +26,7 @@ from studio.api import Studio
 from studio.channels import Latest
 from studio.door import person_of
 from studio.http_takes import takes_router
+from studio.http_view import Views, view_router
 from studio.http_wire import Body, Name, Problem, TaskInfo, as_json, refusals, schema_of
 from studio.lease import Lease, NotDriving, PersonId, Seat
 from studio.pages import add_pages
@@ -100,11 +101,17 @@ class ControlIn(Body):
     action: Literal["ask", "give up", "keep"]  # ask: take it where it is free, else ask its holder
 
 
-def add_api(app: FastAPI, studio: Studio, remote: Remote, lease: Lease) -> Reader:
-    """Mount the routes and our pages; close the reader that is returned when the server has ended."""
+def add_api(
+    app: FastAPI, studio: Studio, remote: Remote, lease: Lease, views: Views | None = None
+) -> Reader:
+    """Mount the routes and our pages; close the reader that is returned when the server has ended.
+
+    `views` are those of the page, where there is one.
+    """
     reader = Reader()
     app.include_router(_session_router(remote, lease), prefix="/api/v1")
     app.include_router(takes_router(studio, remote, reader), prefix="/api/v1")
+    app.include_router(view_router(studio, reader, views), prefix="/api/v1")
     app.include_router(_studio_router(studio), prefix="/api/v1")
     add_pages(app)
 

@@ -33,7 +33,7 @@ from studio.http_wire import (
 from studio.index import EpisodeRow
 from studio.interpolation import newest
 from studio.messages import TakeRestored, TakeTrashed
-from studio.reading import Reader, columns_json, columns_npz
+from studio.reading import Reader, columns_arrow, columns_json, columns_npz
 from studio.ui.remote import Remote
 
 PATIENCE = 5.0  # [s] after which a request for the health of many takes answers with those it has
@@ -146,15 +146,16 @@ def _content_router(studio: Studio, reader: Reader) -> APIRouter:
         episode_id: str,
         group: Annotated[list[str], Query(max_length=20)] = [],  # noqa: B006
         every: Annotated[int, Query(ge=1, le=10**6)] = 1,
-        format: Literal["json", "npz"] = "json",
+        format: Literal["json", "npz", "arrow"] = "json",
     ) -> Response:
         """Columns of some groups, e.g. `right/state`, `right/applied` and `tick`; by default of all.
 
-        `every` thins the rows. As JSON, NaN is null.
+        `every` thins the rows. As JSON, NaN is null. An Arrow stream holds groups with as many rows each.
         """
         read, media = {
             "json": (columns_json, "application/json"),
             "npz": (columns_npz, "application/octet-stream"),
+            "arrow": (columns_arrow, "application/vnd.apache.arrow.stream"),
         }[format]
         with refusals():
             path = catalog.get(episode_id).path

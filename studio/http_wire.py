@@ -23,11 +23,13 @@ from studio.lease import NotDriving
 from studio.survey import DatasetHealth
 
 MOST = 1000  # takes in one answer, or in one request
+MOST_IN_3D = 4  # takes in one 3-D view
 INT64 = 2**63 - 1  # SQLite's
 
 Text = Annotated[str, Field(max_length=20_000)]
 Name = Annotated[str, Field(max_length=200)]
 Quality = Annotated[int, Field(ge=1, le=5)]
+Shift = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 
 
@@ -120,6 +122,16 @@ class CollectionIn(Body):
     note: Text = ""
     episode_ids: Annotated[list[Name], Field(max_length=100_000)] | None = None
     filters: FiltersIn | None = None
+
+
+class ViewIn(Body):
+    """What the 3-D view of a page of the studio is to show."""
+
+    view: Name  # the key by which that page knows itself
+    episode_ids: Annotated[list[Name], Field(max_length=MOST_IN_3D)] = []  # none: the live scene again
+    shifts: list[Shift] = []  # [s] that each take, but the first, is ahead of the first one's time
+    time: Seconds = 0.0  # [s] in the first one
+    speed: Annotated[float, Field(ge=0, le=16, allow_inf_nan=False)] = 0.0  # 0 stands still
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from controller.types import Array
+from studio import curves
 from studio.episode import open_episode
 
 NICE = 5  # behind whatever serves people
@@ -33,17 +34,36 @@ class Reader:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
+        self._aside: Reader | None = None
+
+    @property
+    def aside(self) -> Reader:
+        """A second process, for what takes seconds: nobody waits behind it for a glance at a take."""
+        with self._lock:
+            self._aside = self._aside or Reader()
+            return self._aside
+
+    def start(self) -> None:
+        """Begin to start the process, so that the first who asks need not wait for that."""
+        self._submit(curves.prepare)
 
     def read(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Wait for what `function` returns or raises; a process that died meanwhile is started once more."""
         try:
             return self._submit(function, *args, **kwargs).result()
         except BrokenProcessPool:
-            self.close()
+            self._end_pool()
             return self._submit(function, *args, **kwargs).result()
 
     def close(self) -> None:
-        """End the process; the next call starts another."""
+        """End the process, and the one aside; the next call starts another."""
+        self._end_pool()
+        with self._lock:
+            aside, self._aside = self._aside, None
+        if aside is not None:
+            aside.close()
+
+    def _end_pool(self) -> None:
         with self._lock:
             pool, self._pool = self._pool, None
         if pool is not None:
@@ -61,6 +81,30 @@ def columns_npz(path: Path, groups: tuple[str, ...], every: int) -> bytes:
     file = io.BytesIO()
     np.savez(file, **_columns(path, groups, every))  # type: ignore[arg-type]
     return file.getvalue()
+
+
+def columns_arrow(path: Path, groups: tuple[str, ...], every: int) -> bytes:
+    """The same as a stream of Arrow's; a matrix is a column of lists of fixed length.
+
+    Raise ValueError where the groups have different numbers of rows.
+    """
+    import pyarrow as pa
+
+    columns = _columns(path, groups, every)
+    lengths = {name.rpartition("/")[0]: len(column) for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{group} {n}" for group, n in sorted(lengths.items()))
+        raise ValueError(f"An Arrow table has rows of one length; ask for one group at a time, not {told}.")
+    arrays = {
+        name: pa.array(column)
+        if column.ndim == 1
+        else pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
+        for name, column in columns.items()
+    }
+    table, sink = pa.table(arrays), pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as stream:
+        stream.write_table(table)
+    return bytes(sink.getvalue())
 
 
 def columns_json(path: Path, groups: tuple[str, ...], every: int) -> bytes:

@@ -19,13 +19,17 @@ OPTIONS = {"preset": "veryfast", "crf": "20", "g": "2", "bf": "0"}
 class VideoWriter:
     """One file. Close it, or use it in a `with`; raises OSError where it cannot be written."""
 
-    def __init__(self, path: Path, rate: int, width: int, height: int) -> None:
+    def __init__(
+        self, path: Path, rate: int, width: int, height: int, *, starts_at_once: bool = False
+    ) -> None:
+        """Where it `starts_at_once`, the index stands first: a browser shows it before all has come."""
         if width % 2 or height % 2:
             raise ValueError(f"H.264 needs an even width and height, not {width} x {height}.")
         self.path = path
         self.n_frames = self.size = 0  # [bytes]
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(path), "w")
+        told = {"movflags": "faststart"} if starts_at_once else {}
+        self._container = av.open(str(path), "w", options=told)
         self._stream: Any = self._container.add_stream(ENCODER, rate=rate, options=OPTIONS)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, PIXELS
         self._stream.thread_count = 1  # small pictures: threads cost more than they give
