@@ -22,7 +22,7 @@ from typing import Any, Unpack
 from studio import collections, edits
 from studio.edits import Edit, Outcome, edits_path, sync_folder
 from studio.episode import open_episode, totals_of
-from studio.index import FACETS, SORTS, EpisodeRow, Filters, Index, Stamps, Summary
+from studio.index import FACETS, SORTS, Amount, EpisodeRow, Filters, Index, Stamps, Summary
 
 __all__ = [
     "FACETS",
@@ -82,6 +82,7 @@ def summarise(path: Path) -> Summary:
         recovered=totals.recovered,
         peak_force=totals.peak_force,
         mean_force=totals.mean_force,
+        stiffness_share=totals.stiffness_share,
     )
 
 
@@ -143,6 +144,14 @@ class Catalog:
         """How many matching takes have each value of each of FACETS, the most frequent first."""
         return self._index.facets(filters)
 
+    def amount(self, **filters: Unpack[Filters]) -> Amount:
+        """How much there is of all takes that match."""
+        return self._index.amount(filters)
+
+    def revision(self) -> str:
+        """Another one after every change of a take or a collection, whoever makes it; asking is cheap."""
+        return f"{self._index.revision()}.{collections.revision(self.data_dir)}"
+
     def get(self, episode_id: str) -> EpisodeRow:
         """The take of this id; one that another process has just recorded is found, too."""
         row = self._index.by_id(episode_id)
@@ -180,8 +189,8 @@ class Catalog:
         edit = _edit(author, changes)
         with self._folder_lock():
             rows = [self._get_on_disk(episode_id) for episode_id in dict.fromkeys(episode_ids)]
-            if edit.undo is not None and len(rows) > 1:
-                raise ValueError("An edit is taken back take by take; see `undo`.")
+            if edit.undo is not None:
+                _check_undo(edit.undo, rows)
             for row in rows:
                 _check_times(edit, row)
             for row in rows:
@@ -427,6 +436,13 @@ def _edit(author: str, changes: dict[str, Any]) -> Edit:
         raise TypeError(f"Unknown field {min(unknown)!r}; an edit has {', '.join(possible)}.")
     listed = {name: tuple(value) for name, value in changes.items() if isinstance(value, list)}
     return Edit(author=author, **changes | listed)
+
+
+def _check_undo(edit_id: str, rows: Sequence[EpisodeRow]) -> None:
+    """An edit of several takes has one id in all of them."""
+    for row in rows:
+        if edit_id not in {edit.edit_id for edit in edits.read(edits_path(row.path)).history}:
+            raise KeyError(f"No edit {edit_id!r} to take back in {row.episode_id}.")
 
 
 def _check_times(edit: Edit, row: EpisodeRow) -> None:

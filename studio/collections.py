@@ -99,6 +99,14 @@ def create(
     return collection
 
 
+def revision(data_dir: Path) -> int:
+    """Another one whenever a collection is made, deleted or restored."""
+    try:
+        return _path(data_dir, "x").parent.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
 def names(data_dir: Path) -> list[str]:
     """Of all collections."""
     return sorted(path.stem for path in _path(data_dir, "x").parent.glob("*.json"))

@@ -19,6 +19,7 @@ from studio.messages import Level
 from studio.posture import Posture
 from studio.session import CONTROL_PERIOD, IMAGE_EVERY
 from studio.tasks import Task
+from studio.totals import JOINT_CONTROL
 
 TOUCHES = 1.5  # [N] above it a contact begins; swinging the hand through the air feels up to 1 N
 PARTS = 1.0  # [N] below it a contact ends
@@ -26,7 +27,6 @@ SHORTEST = 0.05  # [s] a phase or a mode that lasts less belongs to the one befo
 STEP = IMAGE_EVERY * CONTROL_PERIOD  # [s] from one camera image to the next
 
 FREE, CONTACT = "free", "contact"
-JOINT_CONTROL = "joint control"  # in place of a stiffness mode
 
 MarkKind = Literal["mode", "limited", "refused", "event"]
 

@@ -34,7 +34,7 @@ from controller.types import Action, ArmAction, Array, Limit, Snapshot
 from studio import schema
 from studio.mcap_file import EpisodeError, McapFile, metadata_of
 from studio.totals import METADATA as TOTALS
-from studio.totals import ForceTally, Totals
+from studio.totals import ForceTally, StiffnessTally, Totals
 
 __all__ = ["Episode", "EpisodeError", "Event", "Header", "Outcome", "open_episode"]
 
@@ -197,8 +197,11 @@ class Episode:
 
     @property
     def totals(self) -> Totals:
-        """As `totals_of`, but counted anew: reads all forces."""
+        """As `totals_of`, but counted anew: reads all forces and actions."""
         tally, outcome = ForceTally(), self.outcome
+        stiffness = StiffnessTally(self.header.control)
+        for action in self.actions("applied"):
+            stiffness.add(action)
         columns = self.columns(*(f"{arm}/state" for arm in self.header.arms))
         for arm in self.header.arms:
             tally.add(columns[f"{arm}/state/wrench"][:, :3])
@@ -210,6 +213,7 @@ class Episode:
             success=outcome.success,
             progress=None if math.isnan(outcome.progress) else outcome.progress,
             recovered=any(event.kind == "recovered" for event in self.events()),
+            stiffness_share=stiffness.shares,
         )
 
     @property

@@ -19,7 +19,7 @@ from studio.edits import sync_folder
 from studio.episode import HEADER_TOPIC, METADATA, PART, Event, Header, Outcome, log_zero
 from studio.mcap_file import McapWriter
 from studio.totals import METADATA as TOTALS
-from studio.totals import ForceTally, Totals
+from studio.totals import ForceTally, StiffnessTally, Totals
 
 JPEG_QUALITY = 90
 FORCE = slice(ARM_ROW["wrench"].start, ARM_ROW["wrench"].start + 3)
@@ -44,7 +44,7 @@ class EpisodeWriter:
         self._zero = log_zero(header.started)
         self._mcap = start_file(self._file, header.to_json(), self._zero)
         self._n_ticks = 0
-        self._forces = ForceTally()
+        self._forces, self._stiffness = ForceTally(), StiffnessTally(header.control)
         self._begin = self._end = 0  # [ns] log times of the first state and the newest
         self._n_view = -1  # periods of the viewers that have begun
         self._shown: dict[str, float] = {}  # camera -> time of its newest image
@@ -64,6 +64,7 @@ class EpisodeWriter:
             add_message(self._mcap, message, round(wall * 1e9))
         for trace in traces:
             self._forces.add(trace[..., FORCE])
+        self._stiffness.add(step.applied.action)
         if self._n_ticks == 0:
             self._begin = self._log_time(float(traces[0][0, 0, 0]))
         self._end = self._log_time(float(traces[-1][0, -1, 0]))
@@ -106,6 +107,7 @@ class EpisodeWriter:
             cameras=tuple(cameras),
             success=outcome.success,
             progress=None if math.isnan(outcome.progress) else outcome.progress,
+            stiffness_share=self._stiffness.shares,
         )
 
     def _traces(self, step: Step) -> list[Array]:

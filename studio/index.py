@@ -10,25 +10,27 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import re
 import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
-from studio.edits import OUTCOMES, Outcome, check_quality
+from studio.edits import Outcome
+from studio.filters import Filters, is_of_buckets, where, where_bucket
 
-SCHEMA = 1  # user_version of the file; any other is discarded and built anew
+SCHEMA = 2  # user_version of the file; any other is discarded and built anew
 BUSY = 30.0  # [s] to wait for another process that writes
 PAGE_CACHE = 64 * 1024  # [kiB]
 # Matches up to which collecting and sorting them beats walking a sorted index. `by_bucket` carries the start,
 # for any other order the rows themselves are read.
 FEW = {"started": 12_000}
 FEW_OTHERWISE = 1_200
+
+__all__ = ["FACETS", "SORTS", "Amount", "EpisodeRow", "Filters", "Index", "Stamps", "Summary"]
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +54,8 @@ class Summary:
     recovered: bool  # put together again after a crash
     peak_force: float  # [N] largest norm over all arms
     mean_force: float  # [N] mean norm over the samples in contact, 0 without any
+    # Of the time under each stiffness mode, over all arms; empty where that was not summed up yet.
+    stiffness_share: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,17 +79,14 @@ class Stamps(NamedTuple):
     sidecar: str
 
 
-class Filters(TypedDict, total=False):
-    """What a selection of takes may ask for; None asks for nothing."""
+@dataclass(frozen=True, slots=True)
+class Amount:
+    """What some takes come to."""
 
-    task: str | None
-    operator: str | None
-    agent: str | None
-    outcome: Outcome | None
-    min_quality: int | None
-    flags: Sequence[str] | None  # all of them
-    seed: int | None
-    text: str | None  # every word of it begins a word of the id, task, people, instruction, note or segments
+    takes: int
+    seconds: float  # [s] of recording
+    successes: int
+    failures: int
 
 
 SORTS = (
@@ -106,7 +107,8 @@ SORTS = (
 FACETS = ("task", "operator", "agent", "outcome", "quality", "flags")
 
 _COLUMNS = tuple(field.name for field in dataclasses.fields(EpisodeRow))
-_TUPLES = ("arms", "cameras", "flags", "trim")  # kept as JSON
+_TUPLES = ("arms", "cameras", "flags", "trim")
+_AS_JSON = (*_TUPLES, "stiffness_share")
 _BOOLS = ("recorded_success", "recovered")
 
 
@@ -145,34 +147,60 @@ class Index:
         if offset < 0 or (limit is not None and limit < 0):
             raise ValueError(f"A page needs limit and offset of 0 or more, not {limit} and {offset}.")
         index = self._best_index(filters, sort)
-        where, values = _where(filters, walks=index != "by_bucket")
+        condition, values = where(filters, walks=index != "by_bucket")
         way = "DESC" if descending else "ASC"
         keys = dict.fromkeys((sort, "started", "bucket", "row"))  # the columns of the index, in its order
         order = ", ".join(f"{key} {way}" for key in keys)
-        page = f"SELECT row FROM episode INDEXED BY {index} WHERE {where} ORDER BY {order} LIMIT ? OFFSET ?"
+        page = (
+            f"SELECT row FROM episode INDEXED BY {index} WHERE {condition} ORDER BY {order} LIMIT ? OFFSET ?"
+        )
         return self._select(
             f"row IN ({page}) ORDER BY {order}", [*values, -1 if limit is None else limit, offset]
         )
 
     def count(self, filters: Filters) -> int:
-        if _is_of_buckets(filters):
-            where, values = _where_bucket(filters)
-            query = f"SELECT coalesce(sum(n), 0) FROM bucket WHERE {where}"
+        if is_of_buckets(filters):
+            condition, values = where_bucket(filters)
+            query = f"SELECT coalesce(sum(n), 0) FROM bucket WHERE {condition}"
         else:
-            where, values = _where(filters)
-            query = f"SELECT count(*) FROM episode WHERE {where}"
+            condition, values = where(filters)
+            query = f"SELECT count(*) FROM episode WHERE {condition}"
         return int(self._rows(query, values)[0][0])
 
     def facets(self, filters: Filters) -> dict[str, dict[str, int]]:
-        if _is_of_buckets(filters):
-            where, values = _where_bucket(filters)
-            counted = f"SELECT bucket_id, n FROM bucket WHERE {where}"
+        if is_of_buckets(filters):
+            condition, values = where_bucket(filters)
+            counted = f"SELECT bucket_id, n FROM bucket WHERE {condition}"
         else:
-            where, values = _where(filters)
-            counted = f"SELECT bucket AS bucket_id, count(*) AS n FROM episode WHERE {where} GROUP BY bucket"
+            condition, values = where(filters)
+            counted = (
+                f"SELECT bucket AS bucket_id, count(*) AS n FROM episode WHERE {condition} GROUP BY bucket"
+            )
         columns = ", ".join(FACETS)
         query = f"SELECT {columns}, counted.n FROM ({counted}) AS counted JOIN bucket USING (bucket_id)"
         return _count_facets(self._rows(query, values))
+
+    def amount(self, filters: Filters) -> Amount:
+        if is_of_buckets(filters):
+            condition, values = where_bucket(filters)
+            counted = f"SELECT outcome, n, ms FROM bucket WHERE {condition}"
+        else:
+            condition, values = where(filters)
+            counted = f"SELECT outcome, 1 AS n, {_MS.format('duration')} AS ms FROM episode WHERE {condition}"
+        query = f"SELECT outcome, sum(n), sum(ms) FROM ({counted}) GROUP BY outcome"
+        found = {outcome: (n, ms) for outcome, n, ms in self._rows(query, values)}
+        return Amount(
+            takes=sum(n for n, _ in found.values()),
+            seconds=sum(ms for _, ms in found.values()) / 1e3,
+            successes=found.get("success", (0, 0))[0],
+            failures=found.get("failure", (0, 0))[0],
+        )
+
+    def revision(self) -> str:
+        """Another one after every change, whichever thread or process makes it."""
+        with self._lock:
+            (others,) = self._db.execute("PRAGMA data_version").fetchone()
+            return f"{others}.{self._db.total_changes}"
 
     def by_id(self, episode_id: str) -> EpisodeRow | None:
         """The take of this id, also one in the trash."""
@@ -246,18 +274,18 @@ class Index:
     def _best_index(self, filters: Filters, sort: str) -> str:
         if filters.get("seed") is not None:
             return "by_seed"
-        if filters.get("text") or not _where_bucket(filters)[1]:
+        if filters.get("text") or not where_bucket(filters)[1]:
             return f"by_{sort}"
         return "by_bucket" if self.count(filters) <= FEW.get(sort, FEW_OTHERWISE) else f"by_{sort}"
 
     def _bucket(self, values: list[Any]) -> int:
         names, marks = ", ".join(FACETS), ", ".join("?" * len(FACETS))
         self._db.execute(f"INSERT OR IGNORE INTO bucket ({names}) VALUES ({marks})", values)
-        where = " AND ".join(f"{name} = ?" for name in FACETS)
-        return int(self._db.execute(f"SELECT bucket_id FROM bucket WHERE {where}", values).fetchone()[0])
+        same = " AND ".join(f"{name} = ?" for name in FACETS)
+        return int(self._db.execute(f"SELECT bucket_id FROM bucket WHERE {same}", values).fetchone()[0])
 
-    def _select(self, where: str, values: Sequence[Any]) -> list[EpisodeRow]:
-        found = self._rows(f"SELECT {', '.join(_COLUMNS)} FROM episode WHERE {where}", values)
+    def _select(self, condition: str, values: Sequence[Any]) -> list[EpisodeRow]:
+        found = self._rows(f"SELECT {', '.join(_COLUMNS)} FROM episode WHERE {condition}", values)
         return [self._decode(dict(zip(_COLUMNS, columns, strict=True))) for columns in found]
 
     def _rows(self, query: str, values: Sequence[Any]) -> list[Any]:
@@ -266,13 +294,14 @@ class Index:
 
     def _encode(self, row: EpisodeRow) -> dict[str, Any]:
         columns = {name: getattr(row, name) for name in _COLUMNS}
-        columns |= {name: json.dumps(columns[name]) for name in _TUPLES}
+        columns |= {name: json.dumps(columns[name]) for name in _AS_JSON}
         return columns | {"path": self._relative(row.path)}
 
     def _decode(self, columns: dict[str, Any]) -> EpisodeRow:
+        for name in _AS_JSON:
+            columns[name] = json.loads(columns[name])
         for name in _TUPLES:
-            value = json.loads(columns[name])
-            columns[name] = None if value is None else tuple(value)
+            columns[name] = None if columns[name] is None else tuple(columns[name])
         for name in _BOOLS:
             columns[name] = None if columns[name] is None else bool(columns[name])
         return EpisodeRow(**columns | {"path": self._data_dir / columns["path"]})
@@ -316,12 +345,13 @@ def _connect(path: Path) -> sqlite3.Connection:
     return db
 
 
+_MS = "CAST(round(1000 * {}) AS INTEGER)"  # [ms] of a duration: integers add up exactly
 _TABLES = f"""
 CREATE TABLE bucket (
     bucket_id INTEGER PRIMARY KEY,
     task TEXT NOT NULL, operator TEXT NOT NULL, agent TEXT NOT NULL,
     outcome TEXT NOT NULL, quality INTEGER NOT NULL, flags TEXT NOT NULL,  -- 0: no quality given
-    n INTEGER NOT NULL DEFAULT 0,
+    n INTEGER NOT NULL DEFAULT 0, ms INTEGER NOT NULL DEFAULT 0,
     UNIQUE ({", ".join(FACETS)})
 );
 CREATE INDEX by_flags ON bucket (flags, n);
@@ -342,82 +372,20 @@ CREATE INDEX by_started ON episode (started, bucket);
 CREATE INDEX by_bucket ON episode (bucket, started);
 {" ".join(f"CREATE INDEX by_{name} ON episode ({name}, started, bucket);" for name in SORTS[1:])}
 CREATE TRIGGER entered AFTER INSERT ON episode BEGIN
-    UPDATE bucket SET n = n + 1 WHERE bucket_id = new.bucket;
+    UPDATE bucket SET n = n + 1, ms = ms + {_MS.format("new.duration")} WHERE bucket_id = new.bucket;
 END;
-CREATE TRIGGER changed AFTER UPDATE OF bucket ON episode WHEN old.bucket IS NOT new.bucket BEGIN
-    UPDATE bucket SET n = n + 1 WHERE bucket_id = new.bucket;
-    UPDATE bucket SET n = n - 1 WHERE bucket_id = old.bucket;
+CREATE TRIGGER changed AFTER UPDATE OF bucket, duration ON episode
+WHEN old.bucket IS NOT new.bucket OR old.duration IS NOT new.duration BEGIN
+    UPDATE bucket SET n = n + 1, ms = ms + {_MS.format("new.duration")} WHERE bucket_id = new.bucket;
+    UPDATE bucket SET n = n - 1, ms = ms - {_MS.format("old.duration")} WHERE bucket_id = old.bucket;
     DELETE FROM bucket WHERE bucket_id = old.bucket AND n = 0;
 END;
 CREATE TRIGGER removed AFTER DELETE ON episode BEGIN
-    UPDATE bucket SET n = n - 1 WHERE bucket_id = old.bucket;
+    UPDATE bucket SET n = n - 1, ms = ms - {_MS.format("old.duration")} WHERE bucket_id = old.bucket;
     DELETE FROM bucket WHERE bucket_id = old.bucket AND n = 0;
     DELETE FROM words WHERE rowid = old.row;
 END;
 """
-
-
-# Filters as SQL: a condition, and values for its question marks.
-
-
-def _where(filters: Filters, *, walks: bool = False) -> tuple[str, list[Any]]:
-    """Of table episode: the buckets that match, or with `walks` a look at the bucket of each row."""
-    bucket, values = _where_bucket(filters)
-    parts = ["bucket IS NOT NULL"]
-    if values and walks:
-        parts = [f"EXISTS (SELECT 1 FROM bucket WHERE bucket_id = episode.bucket AND {bucket})"]
-    elif values:
-        parts = [f"bucket IN (SELECT bucket_id FROM bucket WHERE {bucket})"]
-    if (seed := filters.get("seed")) is not None:
-        parts.append("seed = ?")
-        values.append(seed)
-    if text := filters.get("text"):
-        parts.append("row IN (SELECT rowid FROM words WHERE words MATCH ?)")
-        values.append(_match(text))
-    return " AND ".join(parts), values
-
-
-def _where_bucket(filters: Filters) -> tuple[str, list[Any]]:
-    """Of table bucket: all filters but seed and text."""
-    _check(filters)
-    parts, values = ["TRUE"], []
-    for name in ("task", "operator", "agent", "outcome"):
-        if (value := filters.get(name)) is not None:
-            parts.append(f"{name} = ?")
-            values.append(value)
-    if (quality := filters.get("min_quality")) is not None:
-        parts.append("quality >= ?")
-        values.append(quality)
-    for flag in filters.get("flags") or ():
-        parts.append("flags IN (SELECT flags FROM flag_set WHERE instr(flags, ?))")
-        values.append(json.dumps(flag))
-    return " AND ".join(parts), values
-
-
-def _is_of_buckets(filters: Filters) -> bool:
-    return not filters.get("text") and filters.get("seed") is None
-
-
-def _check(filters: Filters) -> None:
-    possible = Filters.__annotations__
-    unknown = filters.keys() - possible.keys()
-    if unknown:
-        raise TypeError(f"Unknown filter {min(unknown)!r}; possible are {', '.join(possible)}.")
-    outcome, quality = filters.get("outcome"), filters.get("min_quality")
-    if outcome is not None and outcome not in OUTCOMES:
-        raise ValueError(f"Unknown outcome {outcome!r}; possible are {', '.join(OUTCOMES)}.")
-    if quality is not None:
-        check_quality(quality)
-    if isinstance(filters.get("flags"), str):
-        raise ValueError(f"Flags are given as a list of words, not {filters['flags']!r}.")
-
-
-def _match(text: str) -> str:
-    """The FTS5 query for every word of `text`, each as the beginning of a word."""
-    words = re.findall(r"[^\W_]+", text)
-    if not words:
-        raise ValueError(f"Nothing to search for in {text!r}: give letters or digits.")
-    return " ".join(f'"{word}"*' for word in words)
 
 
 def _count_facets(buckets: Sequence[Any]) -> dict[str, dict[str, int]]:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, assert_never
 
 import msgspec
 import numpy as np
 
-from controller.types import Array
+from controller.stiffness import StiffnessTable, nearest_mode
+from controller.types import Action, Array, CartesianTarget, Hold, JointTarget, Release
 
 CONTACT = 1.0  # [N] a larger force counts as contact
+JOINT_CONTROL = "joint control"  # in place of a stiffness mode
 METADATA = "comp-act studio totals"  # name of the MCAP metadata record
 
 
@@ -24,6 +29,7 @@ class Totals:
     success: bool | None  # None: nobody judged
     progress: float | None  # 0..1, None where the task does not measure it
     recovered: bool = False  # put together again after a crash
+    stiffness_share: dict[str, float] = field(default_factory=dict)  # of the time, see `StiffnessTally`
 
     def to_entries(self) -> dict[str, str]:
         """For an MCAP metadata record."""
@@ -58,3 +64,32 @@ class ForceTally:
         self._sum += float(in_contact.sum())
         self._count += in_contact.size
         self.peak = float(norms.max(initial=self.peak))
+
+
+class StiffnessTally:
+    """Counts the ticks of each stiffness mode as they come, over all arms."""
+
+    def __init__(self, control: Mapping[str, Any]) -> None:
+        """`control` is that of the take's header: it tells what the modes mean."""
+        self._table: StiffnessTable = control.get("servo", {}).get("stiffness_table", "tuned")
+        self._modes: dict[int, str] = {}  # of each arm now
+        self._ticks: Counter[str] = Counter()
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Of the time under each mode, and under JOINT_CONTROL; empty where no arm was ever told to move."""
+        total = self._ticks.total()
+        return {mode: round(n / total, 4) for mode, n in self._ticks.most_common()}
+
+    def add(self, applied: Action) -> None:
+        for arm, action in enumerate(applied.arms):
+            match action.target:
+                case CartesianTarget(stiffness=stiffness):
+                    self._modes[arm] = nearest_mode(stiffness, self._table).value
+                case JointTarget():
+                    self._modes[arm] = JOINT_CONTROL
+                case Hold() | Release():
+                    pass  # stays as stiff as it was
+                case unknown:
+                    assert_never(unknown)
+        self._ticks.update(self._modes.values())

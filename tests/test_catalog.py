@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controller.stiffness import stiffness_of
 from controller.types import (
     ARM_ROW,
     ARM_ROW_WIDTH,
@@ -24,14 +25,23 @@ from controller.types import (
     Applied,
     ArmAction,
     ArmState,
+    CartesianTarget,
     Hold,
+    JointTarget,
     Observation,
+    Pose,
+    Release,
     Step,
+    StiffnessMode,
 )
+from studio import collections
+from studio.api import DemoReport
 from studio.catalog import FACETS, SORTS, Catalog, EpisodeRow, Filters, Summary, summarise
+from studio.cursor import Cursor
 from studio.edits import FLAGS, OUTCOMES, Edit, Segment, append, edits_path, read
 from studio.episode import Header, Outcome, open_episode, totals_of
 from studio.episode_writer import EpisodeWriter
+from studio.totals import StiffnessTally
 
 OUTCOME_OF = {True: "success", False: "failure", None: "unmarked"}
 
@@ -611,3 +621,56 @@ def test_an_older_take_without_sums_is_read_whole(data: Path) -> None:
     path.write_bytes(old)
     assert totals_of(path) is None
     assert dataclasses.replace(summarise(path), duration=summed.duration) == summed
+
+
+# What changes are heard of.
+
+
+def test_a_revision_tells_every_change_whoever_makes_it(data: Path, catalog: Catalog) -> None:
+    seen = [catalog.revision()]
+
+    def has_changed() -> bool:
+        seen.append(catalog.revision())
+        return seen[-1] not in seen[:-1]
+
+    record(data, "take-1")
+    catalog.refresh()
+    assert has_changed()
+    assert not has_changed()
+    catalog.episodes()
+    assert not has_changed()
+    catalog.annotate("take-1", author="ann", quality=3)
+    assert has_changed()
+    with Catalog(data) as of_another_process:
+        of_another_process.annotate("take-1", author="bob", quality=4)
+    assert has_changed()
+    collections.create(catalog, "some", author="ann", episode_ids=["take-1"])
+    assert has_changed()
+
+
+def test_how_long_each_stiffness_was_used_adds_up_to_the_whole(data: Path) -> None:
+    tally = StiffnessTally({})
+    pose = Pose.identity()
+    soft, stiff = (
+        CartesianTarget(pose, stiffness_of(mode)) for mode in (StiffnessMode.LOW, StiffnessMode.HIGH)
+    )
+    for targets in ((Hold(), soft), (Hold(), Hold()), (JointTarget(np.zeros(6)), stiff), (stiff, Release())):
+        tally.add(Action(tuple(ArmAction(target, 1.0) for target in targets)))
+    # The first arm was told nothing for two ticks; held arms stay as stiff as they were.
+    assert tally.shares == {"high": 0.5, "low": 0.3333, "joint control": 0.1667}
+    assert StiffnessTally({}).shares == {}
+
+
+def test_shares_of_stiffness_are_the_same_summed_up_and_counted_anew(
+    recorded: tuple[Path, DemoReport],
+) -> None:
+    with Catalog(recorded[0]) as catalog:
+        for row in catalog.episodes():
+            with open_episode(row.path) as episode:
+                assert episode.totals.stiffness_share == row.stiffness_share
+                (arm,) = Cursor(episode).arms
+                spans = {span.label: 0.0 for span in arm.modes}
+                for span in arm.modes:
+                    spans[span.label] += (span.end - span.start) / episode.duration
+            assert row.stiffness_share == pytest.approx(spans, abs=0.02)
+            assert sum(row.stiffness_share.values()) == pytest.approx(1.0, abs=1e-3)

@@ -185,7 +185,7 @@ def test_one_edit_goes_to_all_takes_or_to_none(data: Path, ids: list[str]) -> No
             ([*ids, "nothing"], {"quality": 1}, KeyError),
             (ids, {"quality": 9}, ValueError),
             (ids, {"trim": (0.0, studio.catalog.get(ids[0]).duration)}, ValueError),  # the other is shorter
-            (ids, {"undo": "x"}, ValueError),
+            (ids, {"undo": "x"}, KeyError),
             (ids, {}, ValueError),
         ):
             versions = [read(row.path.with_suffix(".edits.jsonl")).version for row in rows]
@@ -193,6 +193,8 @@ def test_one_edit_goes_to_all_takes_or_to_none(data: Path, ids: list[str]) -> No
             with pytest.raises(error):
                 studio.annotate_all(longest_first, author="ann", **changes)  # type: ignore[arg-type]
             assert [read(row.path.with_suffix(".edits.jsonl")).version for row in rows] == versions
+        studio.annotate_all(ids, author="ann", edit_id="both", quality=5)
+        assert {row.quality for row in studio.annotate_all(ids, author="ann", undo="both")} == {None, 3}
 
 
 def run_studio(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:

@@ -41,6 +41,9 @@ def check(catalog: Catalog, rows: list[EpisodeRow]) -> None:
     for filters in FILTERS:
         wanted = [row for row in rows if matches(row, filters)]
         assert catalog.count(**filters) == len(wanted) > 0
+        amount = catalog.amount(**filters)
+        assert (amount.takes, amount.successes) == (len(wanted), sum(r.outcome == "success" for r in wanted))
+        assert amount.seconds == pytest.approx(sum(row.duration for row in wanted), abs=5e-4 * len(wanted))
         facets = catalog.facets(**filters)
         for name in ("task", "operator", "agent", "outcome"):
             assert facets[name] == Counter(getattr(row, name) for row in wanted)
@@ -59,6 +62,7 @@ def check(catalog: Catalog, rows: list[EpisodeRow]) -> None:
             assert [row.episode_id for row in page] == [row.episode_id for row in ordered[7:57]]
     for text in TEXTS:
         assert catalog.count(text=text) == sum(says(row, text) for row in rows)
+        assert catalog.amount(text=text).takes == catalog.count(text=text)
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,7 @@ def made_up_row(data_dir: Path, number: int) -> EpisodeRow:
         recovered=False,
         peak_force=rng.uniform(0, 40),
         mean_force=rng.uniform(0, 8),
+        stiffness_share=_made_up_shares(number),
         outcome=outcome,
         quality=rng.choices((None, 1, 2, 3, 4, 5), (50, 2, 5, 13, 20, 10))[0],
         flags=tuple(sorted(rng.sample(FLAGS, n_flags))),
@@ -97,6 +98,12 @@ def made_up_row(data_dir: Path, number: int) -> EpisodeRow:
         path=data_dir / "episodes" / task / f"{episode_id}.mcap",
         size=rng.randrange(10**6, 10**8),
     )
+
+
+def _made_up_shares(number: int) -> dict[str, float]:
+    """Of a number; an early take has none."""
+    low = number % 10 / 10
+    return {"low": low, "medium": round(1 - low, 1)} if number >= 100 else {}
 
 
 def _answers(data: Path) -> dict[str, float]:
@@ -112,6 +119,7 @@ def _answers(data: Path) -> dict[str, float]:
             ],
             "search_ms": [partial(catalog.episodes, text=text, limit=50) for text in TEXTS],
             "facets_ms": [partial(catalog.facets, **filters) for filters in FILTERS],
+            "amount_ms": [partial(catalog.amount, **filters) for filters in FILTERS],
         }
         numbers = count()
         results: dict[str, float] = {}
