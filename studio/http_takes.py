@@ -31,11 +31,11 @@ from studio.http_wire import (
     refusals,
 )
 from studio.index import EpisodeRow
-from studio.interpolation import newest
 from studio.messages import TakeRestored, TakeTrashed
-from studio.reading import Reader, columns_arrow, columns_json, columns_npz
+from studio.reading import Reader, columns_arrow, columns_json, columns_npz, jpeg, jpeg_at
 from studio.ui.remote import Remote
 
+UNCHANGING = {"Cache-Control": "private, max-age=86400, immutable"}  # of recordings, which nobody edits
 PATIENCE = 5.0  # [s] after which a request for the health of many takes answers with those it has
 
 REFUSED: dict[int | str, dict[str, Any]] = {
@@ -177,15 +177,16 @@ def _content_router(studio: Studio, reader: Reader) -> APIRouter:
     @router.get("/episodes/{episode_id}/images/{camera}/{number}")
     def read_image(episode_id: str, camera: str, number: Number) -> Response:
         """One image by its number, a JPEG."""
-        with refusals(), studio.open(episode_id) as episode:
-            return Response(episode.jpeg(camera, number), media_type="image/jpeg")
+        with refusals():
+            image = reader.read(jpeg, catalog.get(episode_id).path, camera, number)
+        return Response(image, media_type="image/jpeg", headers=UNCHANGING)
 
     @router.get("/episodes/{episode_id}/images/{camera}/at/{at}")
     def read_image_at(episode_id: str, camera: str, at: Time) -> Response:
         """The newest image at or before a time, else the first."""
-        with refusals(), studio.open(episode_id) as episode:
-            number = newest(episode.image_times(camera), at)
-            return Response(episode.jpeg(camera, number), media_type="image/jpeg")
+        with refusals():
+            image = reader.read(jpeg_at, catalog.get(episode_id).path, camera, at)
+        return Response(image, media_type="image/jpeg", headers=UNCHANGING)
 
     return router
 
