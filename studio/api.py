@@ -27,6 +27,8 @@ from studio.export import imports
 from studio.health import TakeHealth
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
+from studio.jobs.plans import Request
+from studio.jobs.queue import JobNow, Jobs
 from studio.pilot import runs_of
 from studio.recovery import Recovery, recover_all
 from studio.session import Agent
@@ -61,6 +63,7 @@ class Studio:
     def __init__(self, data: str | Path = "data") -> None:
         self.data_dir = Path(data).absolute()
         self.catalog = Catalog(self.data_dir)
+        self.jobs = Jobs(self.data_dir)
 
     def __enter__(self) -> Studio:
         return self
@@ -194,6 +197,10 @@ class Studio:
     def evaluations(self) -> list[Evaluation]:
         """The newest first."""
         return load_all(self.data_dir)
+
+    def submit(self, request: Request) -> JobNow:
+        """Put a job into the queue; `studio.jobs.plans` makes requests, `jobs` tells what becomes of them."""
+        return self.jobs.submit(request.job, request.files)
 
     # Takes
 

@@ -248,11 +248,14 @@ def _rollouts(plan: Plan, data_dir: Path, evaluation_id: str, workers: int) -> I
         min(workers, len(plan.seeds)), get_context("spawn"), _prepare, (plan, data_dir, evaluation_id)
     ) as pool:
         seeds: dict[Future[_Done], int] = {pool.submit(_roll_out_here, seed): seed for seed in plan.seeds}
-        for future in as_completed(seeds):
-            try:
-                yield future.result()
-            except BrokenProcessPool as error:
-                yield _Done(Rollout(seeds[future], False, error=f"A worker process died: {error}"))
+        try:
+            for future in as_completed(seeds):
+                try:
+                    yield future.result()
+                except BrokenProcessPool as error:
+                    yield _Done(Rollout(seeds[future], False, error=f"A worker process died: {error}"))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)  # interrupted: the other seeds need not come
 
 
 def _roll_out(

@@ -25,6 +25,7 @@ from studio import tasks
 from studio.api import Studio
 from studio.channels import Latest
 from studio.door import person_of
+from studio.http_jobs import jobs_router
 from studio.http_takes import takes_router
 from studio.http_view import Views, view_router
 from studio.http_wire import Body, Name, Problem, TaskInfo, as_json, refusals, schema_of
@@ -113,6 +114,7 @@ def add_api(
     app.include_router(takes_router(studio, remote, reader), prefix="/api/v1")
     app.include_router(view_router(studio, reader, views), prefix="/api/v1")
     app.include_router(_studio_router(studio), prefix="/api/v1")
+    app.include_router(jobs_router(studio), prefix="/api/v1")
     add_pages(app)
 
     @app.get("/api/docs", include_in_schema=False)

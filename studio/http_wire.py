@@ -19,6 +19,7 @@ from studio.edits import Edit, Outcome, Segment
 from studio.episode import EpisodeError, Event
 from studio.health import Grade
 from studio.index import SORTS, EpisodeRow, Filters
+from studio.jobs.queue import JobBusyError
 from studio.lease import NotDriving
 from studio.survey import DatasetHealth
 
@@ -201,7 +202,7 @@ def refusals() -> Iterator[None]:
     """Around what a request asks for: what is refused becomes an answer with a sentence."""
     try:
         yield
-    except (NotFinishedError, InUseError, NotDriving, EpisodeError, FileExistsError) as error:
+    except (NotFinishedError, InUseError, NotDriving, EpisodeError, FileExistsError, JobBusyError) as error:
         raise HTTPException(409, _words(error)) from error
     except (KeyError, IndexError, FileNotFoundError) as error:
         raise HTTPException(404, _words(error)) from error

@@ -2,6 +2,7 @@
 
     DATA/cache/<key>/    pictures and tracks of the takes, see `policy.dataset`; may be deleted
     DATA/runs/<name>/    takes.json: what the run learns from
+                         origin.json: who asked for it, how the takes were chosen, with which code, where
                          config.json: its settings; metrics.jsonl: one line a step; checkpoints/
 
 A run keeps learning from the takes as they were when it began, whatever is edited meanwhile.
@@ -10,13 +11,16 @@ A run keeps learning from the takes as they were when it began, whatever is edit
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import hashlib
 import json
 import os
+import platform
 import re
+import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,13 +35,15 @@ from studio import collections
 from studio.catalog import Catalog
 from studio.episode import Episode, open_episode
 from studio.index import EpisodeRow, Filters
+from studio.recorder import versions
 
 if TYPE_CHECKING:
     from policy.train import TrainResult
 
 EVALUATION = "evaluation"  # operator of rollouts, which are not demonstrations
 CACHE_TIMEOUT = 3600.0  # [s] that a process of a run waits for the one that reads the takes
-TAKES = "takes.json"
+TAKES, ORIGIN, LOCK = "takes.json", "origin.json", ".lock"  # in the folder of a run
+DEMONSTRATORS = ("operator", "scripted", "nobody")  # agents that are no policy
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
@@ -114,12 +120,32 @@ def reopen(catalog: Catalog, name: str) -> Run:
             f"No run {name!r}; there are {sorted(p.parent.name for p in runs.glob(f'*/{CONFIG}'))}."
         )
     told = json.loads((folder / CONFIG).read_text())
-    takes = tuple(map(Chosen.from_json, json.loads((folder / TAKES).read_text())))
+    takes = chosen_in(folder / TAKES)
     try:
         done = read_spec(folder).step
     except FileNotFoundError:
         done = 0  # stopped before its first checkpoint
     return Run(folder, told["task"], TrainConfig.from_json(told["config"]), takes, done)
+
+
+def chosen_in(path: Path) -> tuple[Chosen, ...]:
+    """Which takes a file names that `lay_out` wrote. Raises ValueError where it cannot be read."""
+    try:
+        return tuple(map(Chosen.from_json, json.loads(path.read_text())))
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} names no takes: {error!r}.") from error
+
+
+def lay_out(run: Run, asked: Mapping[str, Any]) -> None:
+    """Write down what a new run is, so that `reopen` finds it; `asked` tells how its takes were chosen."""
+    run.folder.mkdir(parents=True, exist_ok=True)
+    takes = [dataclasses.asdict(take) for take in run.takes]
+    (run.folder / TAKES).write_text(json.dumps(takes, indent=1))
+    origin = {"created": time.time(), **asked, "versions": {**versions(), **_commit()}, "machine": _machine()}
+    (run.folder / ORIGIN).write_text(json.dumps(origin, indent=1, default=str))
+    names = [take.episode_id for take in run.takes]
+    told = {"task": run.task, "takes": names, "config": dataclasses.asdict(run.config)}
+    (run.folder / CONFIG).write_text(json.dumps(told, indent=1))
 
 
 def dataset_of(catalog: Catalog, run: Run, on_take: Callable[[str], None] = lambda name: None) -> Dataset:
@@ -152,16 +178,41 @@ def train(
 ) -> TrainResult:
     """Let a run learn, or go on, until it is finished or SIGTERM comes. Loads torch.
 
-    `on_step` hears the metrics of each step. Under `torchrun` each process calls this.
+    `on_step` hears the metrics of each step. Under `torchrun` each process calls this. Raises RuntimeError
+    where another process lets the run learn.
     """
     from policy.train import train as learn
 
-    if leads() and not (run.folder / TAKES).exists():
-        run.folder.mkdir(parents=True, exist_ok=True)
-        (run.folder / TAKES).write_text(
-            json.dumps([dataclasses.asdict(take) for take in run.takes], indent=1)
-        )
-    return learn(run.config, dataset, run.folder, resume=run.is_begun, tell=on_step)
+    if not leads():
+        return learn(run.config, dataset, run.folder, resume=run.is_begun, tell=on_step)
+    if not (run.folder / TAKES).exists():
+        lay_out(run, {})
+    with _alone(run.folder):
+        return learn(run.config, dataset, run.folder, resume=run.is_begun, tell=on_step)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Be the only one that lets a run learn; the lock dies with its process."""
+    with (folder / LOCK).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RuntimeError(f"Another process lets {folder.name} learn already.") from None
+        yield
+
+
+def _commit() -> dict[str, str]:
+    """Which code, where this is a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    with suppress(OSError, subprocess.SubprocessError):
+        told = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=True)
+        return {"commit": told.stdout.strip()}
+    return {}
+
+
+def _machine() -> dict[str, Any]:
+    return {"name": platform.node(), "system": platform.platform(), "cores": os.cpu_count()}
 
 
 def leads() -> bool:
@@ -233,9 +284,19 @@ def _named(catalog: Catalog, task: str, name: str, filters: Filters | None) -> l
 
 
 def _select(catalog: Catalog, filters: Filters) -> list[EpisodeRow]:
-    """Those that match, as they were recorded; rollouts of an evaluation only where they are asked for."""
+    """Those that match, as they were recorded; what a policy drove only where it is asked for."""
     rows = catalog.episodes(sort="started", descending=False, limit=None, **filters)
-    return [row for row in rows if filters.get("operator") or row.operator != EVALUATION]
+    if filters.get("operator") or filters.get("agent"):
+        return rows
+    return [row for row in rows if row.operator != EVALUATION and not _is_of_policy(row)]
+
+
+def _is_of_policy(row: EpisodeRow) -> bool:
+    """Whether a policy drove it on the page."""
+    if row.agent in DEMONSTRATORS:
+        return False
+    with open_episode(row.path) as episode:
+        return "run" in episode.header.provenance
 
 
 def _why_none(catalog: Catalog, task: str, filters: Filters) -> str:

@@ -25,7 +25,7 @@ ONLY_IN = {
     "viser": ("studio/ui/", "studio/server.py", "studio/site.py"),
     "rerun": ("studio/export/rrd.py",),
     "openvr": ("studio/inputs/steamvr.py",),
-    "ray": ("studio/jobs.py",),
+    "ray": ("studio/jobs/cluster.py",),
     "h5py": ("studio/export/act_hdf5.py",),
     "av": ("studio/export/video.py",),
     "sqlite3": ("studio/index.py",),
@@ -44,7 +44,7 @@ LAYERS = (
     ("api",),
     (
         *("server", "site", "headset", "http", "http_takes", "http_wire", "reading", "ui", "serve"),
-        *("commands", "client", "__main__"),
+        *("http_jobs", "commands", "client", "__main__"),
     ),
 )
 SKINS = len(LAYERS) - 1

@@ -9,7 +9,18 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from studio.commands.terminal import DATA, Data, Json, console, print_json, progress
+from studio.commands.terminal import (
+    DATA,
+    Data,
+    Json,
+    ProgressPath,
+    console,
+    ends_orderly,
+    plain,
+    print_json,
+    progress,
+)
+from studio.jobs.progress import ProgressFile
 
 PERCENT = 100
 
@@ -31,7 +42,9 @@ def export(
     cameras: tuple[str, ...] | None = None,
     images: bool = True,
     pad: bool = True,
+    takes: Path | None = None,
     data: Data = DATA,
+    progress_file: ProgressPath = None,
     json: Json = False,
 ) -> int:
     """Write takes as a dataset or as Rerun recordings, all or nothing; Ctrl-C removes what was written.
@@ -49,16 +62,22 @@ def export(
         cameras: Only these.
         images: Off leaves out all cameras.
         pad: ACT files are as long as the longest, the last row repeated.
+        takes: The takes.json of a run or a job: exactly these takes, with the edits that they had then.
     """
     from studio.api import Studio
     from studio.export import Options
+    from studio.training import chosen_in
 
     options = Options(rate, actions, cameras if images else (), pad)
     filters = (task, operator, agent, outcome, min_quality, *flags)
-    if sum((bool(ids), collection is not None, any(filters))) != 1:
+    if sum((bool(ids), collection is not None, takes is not None, any(filters))) != 1:
         raise ValueError("Say which takes: by their ids, as a --collection, or by a filter such as --task.")
     with Studio(data) as studio:
-        if collection is not None:
+        if takes is not None:
+            named = chosen_in(takes)
+            chosen = [take.episode_id for take in named]
+            versions = {t.episode_id: t.edit_version for t in named if t.edit_version is not None}
+        elif collection is not None:
             members = studio.collection(collection).members
             chosen = [member.episode_id for member in members]
             versions = {member.episode_id: member.edit_version for member in members}
@@ -74,8 +93,10 @@ def export(
                 flags=flags or None,
             )
             chosen, versions = [row.episode_id for row in reversed(rows)], {}
-        with _percents(_takes(chosen), quiet=json) as tell:
+        file = ProgressFile(progress_file, PERCENT)
+        with _percents(_takes(chosen), quiet=json, file=file) as tell, ends_orderly():
             done = studio.export(chosen, out, format, options, versions=versions, on_progress=tell)
+        file.end(plain(done))
     if json:
         print_json(done)
         return 0
@@ -124,13 +145,17 @@ def _takes(names: Sequence[str]) -> str:
 
 
 @contextmanager
-def _percents(what: str, quiet: bool) -> Iterator[Callable[[float, str], None]]:
+def _percents(
+    what: str, quiet: bool, file: ProgressFile | None = None
+) -> Iterator[Callable[[float, str], None]]:
     """A progress bar for what tells its share, 0..1."""
     with progress(what, PERCENT, quiet=quiet) as advance:
         shown = 0
 
         def tell(share: float, name: str) -> None:
             nonlocal shown
+            if file is not None:
+                file.tell(share * PERCENT, name)
             while shown < int(share * PERCENT):
                 shown += 1
                 advance()

@@ -14,15 +14,19 @@ from studio.commands.terminal import (
     DATA,
     Data,
     Json,
+    ProgressPath,
     TaskName,
     console,
+    ends_orderly,
     errors,
+    plain,
     print_json,
     progress,
     say,
     table_of,
 )
 from studio.index import Filters
+from studio.jobs.progress import ProgressFile
 
 
 def train(
@@ -37,6 +41,7 @@ def train(
     flags: tuple[str, ...] = (),
     collection: str | None = None,
     data: Data = DATA,
+    progress_file: ProgressPath = None,
     json: Json = False,
 ) -> int:
     """Learn a policy from the successful demonstrations of a task. Stopped, it can go on.
@@ -67,14 +72,20 @@ def train(
             else studio.begin_run(task, config, name, episodes, filters, collection)
         )
         total = run.config.steps - run.done
+        file = ProgressFile(progress_file if training.leads() else None, run.config.steps, run.done)
         with progress(f"{run.folder.name}, {len(run.takes)} takes", total, quiet=quiet) as advance:
 
             def tell(metrics: Mapping[str, float]) -> None:
                 advance()
+                file.tell(metrics["step"])
                 if "validation" in metrics and not quiet:
                     errors.print(_training_line(metrics))
 
-            result = studio.train(run, on_step=tell)
+            def read(name: str) -> None:
+                file.tell(run.done, f"reads {name}")
+
+            result = studio.train(run, on_take=read, on_step=tell)
+        file.end(plain(result))
     if json and training.leads():
         print_json(result)
     elif training.leads():
@@ -110,6 +121,7 @@ def evaluate(
     workers: int = 1,
     cameras: bool = False,
     spread: float = 1.0,
+    progress_file: ProgressPath = None,
     json: Json = False,
 ) -> int:
     """Roll out an agent over many seeds; every rollout is an episode.
@@ -134,6 +146,7 @@ def evaluate(
     """
     from studio.api import Studio
     from studio.evaluate import Plan
+    from studio.evaluation import Rollout
     from studio.evaluation import compare as compared
 
     plan = Plan.of(
@@ -151,8 +164,15 @@ def evaluate(
     )
     with Studio(data) as studio:
         other = studio.evaluation(compare, plan.task) if compare else None
-        with progress(f"{plan.run} on {plan.task}", len(plan.seeds), quiet=json) as advance:
-            found = studio.evaluate(plan, workers=workers, on_rollout=lambda rollout: advance())
+        file = ProgressFile(progress_file, len(plan.seeds))
+        with progress(f"{plan.run} on {plan.task}", len(plan.seeds), quiet=json) as advance, ends_orderly():
+
+            def tell(rollout: Rollout) -> None:
+                advance()
+                file.add(plain(rollout))
+
+            found = studio.evaluate(plan, workers=workers, on_rollout=tell)
+        file.end(found.summary())
     comparison = compared(found, other) if other else None
     if json:
         paired = {"comparison": dataclasses.asdict(comparison)} if comparison else {}

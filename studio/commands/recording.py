@@ -12,12 +12,16 @@ from studio.commands.terminal import (
     DATA,
     Data,
     Json,
+    ProgressPath,
     TaskName,
     console,
+    ends_orderly,
+    plain,
     print_json,
     progress,
     table_of,
 )
+from studio.jobs.progress import ProgressFile
 
 
 def show_tasks(pictures: Path | None = None, json: Json = False) -> int:
@@ -68,6 +72,7 @@ def demo(
     cameras: bool = True,
     spread: float = 1.0,
     stiffness_table: Literal["tuned", "literal"] = "tuned",
+    progress_file: ProgressPath = None,
     json: Json = False,
 ) -> int:
     """Record scripted demonstrations, headless.
@@ -81,8 +86,17 @@ def demo(
         stiffness_table: What low, medium and high mean: our values, or the paper's numbers on all diagonals.
     """
     from studio.api import Studio
+    from studio.station import Take
 
-    with Studio(data) as studio, progress(f"{task}", episodes, quiet=json) as advance:
+    file, taken = ProgressFile(progress_file, episodes), 0
+
+    def tell(take: Take) -> None:
+        nonlocal taken
+        taken += 1
+        advance()
+        file.tell(taken, take.episode_id)
+
+    with Studio(data) as studio, progress(f"{task}", episodes, quiet=json) as advance, ends_orderly():
         report = studio.demo(
             task,
             episodes,
@@ -91,8 +105,9 @@ def demo(
             workers=workers,
             spread=spread,
             stiffness_table=stiffness_table,
-            on_take=lambda take: advance(),
+            on_take=tell,
         )
+    file.end(plain(report))
     if json:
         print_json(dataclasses.asdict(report))
     else:

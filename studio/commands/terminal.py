@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +21,10 @@ from tyro.conf import arg
 Data = Annotated[Path, arg(metavar="DIR", help="The data folder.")]
 Json = Annotated[bool, arg(name="json", help="Print one JSON value instead of text.")]
 EpisodeId = Annotated[str, arg(metavar="ID", help="An episode; see `studio episodes`.")]
+ProgressPath = Annotated[
+    Path | None,
+    arg(metavar="FILE", help="Keep telling this file how far it is, as JSON."),
+]
 TaskName = Annotated[str, arg(metavar="TASK", help="A task; see `studio tasks`.")]
 
 DATA = Path("data")
@@ -73,3 +79,21 @@ def progress(what: str, total: int, quiet: bool) -> Iterator[Callable[[], None]]
     with Progress(*columns, console=errors, disable=quiet or not errors.is_terminal, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
+
+
+@contextmanager
+def ends_orderly() -> Iterator[None]:
+    """Let SIGTERM do what Ctrl-C does: what is half done is put away before the process ends."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
