@@ -15,10 +15,10 @@ import numpy as np
 from controller.servo import ServoConfig
 from controller.types import Array
 from studio import tasks
-from studio.episode import Episode
+from studio.episode import Episode, Header
 from studio.session import CONTROL_PERIOD, IMAGE_EVERY, LATE
 
-VERSION = 1  # of these checks: what an older version found is looked for again
+VERSION = 2  # of these checks: what an older version found is looked for again
 
 Kind = Literal[
     "unreadable",
@@ -113,7 +113,7 @@ def _overlaps(finding: Finding, trim: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """What was measured, at 500 Hz."""
+    """What was measured, at 500 Hz or at the rate of the dataset that it was imported from."""
 
     name: str
     time: Array  # (n,) [s]
@@ -122,6 +122,7 @@ class _Arm:
     position: Array  # (n, 3) [m]
     wrench: Array  # (n, 6)
     gripper: Array  # (n,)
+    period: float  # [s] from one sample to the next, as it should be
 
 
 def check(episode: Episode) -> TakeHealth:
@@ -131,15 +132,17 @@ def check(episode: Episode) -> TakeHealth:
     """
     header, duration = episode.header, episode.duration
     columns = episode.columns(*(f"{arm}/state" for arm in header.arms), "tick")
-    arms = [_arm(columns, name) for name in header.arms]
+    imported = _imported_period(header)
+    arms = [_arm(columns, name, imported or FAST) for name in header.arms]
     ticks = columns["tick/time"]
     if len(ticks) < 2 or any(len(arm.time) < 2 for arm in arms):
         raise ValueError(f"{header.episode_id} holds no states: it was cut off as it began.")
     origin = float(arms[0].time[0])
     images = {camera: episode.image_times(camera) for camera in episode.cameras}
-    streams = [(f"states of {arm.name}", arm.time, FAST) for arm in arms]
-    streams += [("ticks", ticks, CONTROL_PERIOD)]
-    streams += [(f"images of {name}", times, IMAGE_PERIOD) for name, times in images.items() if len(times)]
+    streams = [(f"states of {arm.name}", arm.time, arm.period) for arm in arms]
+    streams += [("ticks", ticks, imported or CONTROL_PERIOD)]
+    image_period = imported or IMAGE_PERIOD
+    streams += [(f"images of {name}", times, image_period) for name, times in images.items() if len(times)]
     late = columns["tick/late"]
     findings = [
         *_streams(streams, origin, origin + duration),
@@ -161,9 +164,15 @@ def check(episode: Episode) -> TakeHealth:
     )
 
 
-def _arm(columns: Mapping[str, Array], name: str) -> _Arm:
+def _imported_period(header: Header) -> float | None:
+    """[s] between all samples of a take that was a dataset's; None for one recorded here."""
+    rate = header.provenance.get("imported_from", {}).get("rate_Hz")
+    return 1 / rate if isinstance(rate, int | float) and rate > 0 else None
+
+
+def _arm(columns: Mapping[str, Array], name: str, period: float) -> _Arm:
     state = {key: columns[f"{name}/state/{key}"] for key in ("time", "q", "dq", "wrench", "gripper")}
-    return _Arm(name, position=columns[f"{name}/state/base_from_tcp"][:, :3], **state)
+    return _Arm(name, position=columns[f"{name}/state/base_from_tcp"][:, :3], period=period, **state)
 
 
 def _since(origin: float, finding: Finding) -> Finding:
@@ -264,7 +273,8 @@ def _forces(arm: _Arm) -> Iterator[Finding]:
     steps = np.nan_to_num(np.diff(force, axis=0))
     sizes = np.linalg.norm(steps, axis=1)
     there_and_back = np.minimum(sizes[:-1], sizes[1:]) * ((steps[:-1] * steps[1:]).sum(axis=1) < 0)
-    if len(there_and_back) and there_and_back.max() > GLITCH:
+    # A sample of a slow dataset lasts long enough for a real knock.
+    if arm.period <= FAST and len(there_and_back) and there_and_back.max() > GLITCH:
         worst = int(there_and_back.argmax())
         text = f"The force of {arm.name} jumped by {there_and_back[worst]:.0f} N for one sample."
         moment = float(arm.time[worst + 1])
@@ -273,12 +283,12 @@ def _forces(arm: _Arm) -> Iterator[Finding]:
 
 def _speeds(arm: _Arm) -> Iterator[Finding]:
     steps = np.diff(arm.time)[:, None]
-    moved = np.abs(np.diff(arm.q, axis=0)) / np.maximum(steps, FAST / 2)
+    moved = np.abs(np.diff(arm.q, axis=0)) / np.maximum(steps, arm.period / 2)
     speed = np.nan_to_num(np.maximum(moved, np.abs(arm.dq[1:])).max(axis=1))
     jump = np.nan_to_num(np.abs(np.diff(arm.dq, axis=0)).max(axis=1))
     for values, limit, words in (
         (speed, TOO_FAST, "turned at {0:.1f} rad/s, faster than its joints can"),
-        (jump, JERKS, "changed its speed by {0:.2f} rad/s within a sample"),
+        (jump, JERKS * arm.period / FAST, "changed its speed by {0:.2f} rad/s within a sample"),
     ):
         if values.max() > limit:
             worst = int(values.argmax())
@@ -332,7 +342,7 @@ def _moved(arm: _Arm, start: float, end: float) -> float:
 
 def _idle(arms: Sequence[_Arm]) -> Iterator[Finding]:
     """Before anything moves, and after everything has."""
-    span = max(1, round(WINDOW / FAST))
+    span = max(1, round(WINDOW / arms[0].period))
     begin, end = float(arms[0].time[0]), float(arms[0].time[-1])
     begins, ends = [], []
     for arm in arms:
@@ -340,7 +350,7 @@ def _idle(arms: Sequence[_Arm]) -> Iterator[Finding]:
             continue
         turned = np.abs(arm.q[span:] - arm.q[:-span]).max(axis=1)
         gripped = np.abs(arm.gripper[span:] - arm.gripper[:-span])
-        (busy,) = np.nonzero((turned > STILL * WINDOW) | (gripped > GRIPS))
+        (busy,) = np.nonzero((turned > STILL * span * arm.period) | (gripped > GRIPS))
         if len(busy):
             begins.append(float(arm.time[busy[0]]))
             ends.append(float(arm.time[busy[-1] + span]))

@@ -21,6 +21,7 @@ from studio.api import Studio
 from studio.cursor import Cursor
 from studio.episode import Episode
 from studio.export import Cancelled, Format, Options
+from studio.health import check
 
 ARMS = ("left", "right")
 
@@ -46,6 +47,7 @@ def test_what_was_exported_comes_back(tmp_path: Path, form: Format) -> None:
         with studio.open(take) as before, other.open(first) as after:
             assert after.header.provenance["imported_from"]["take"] == take
             assert after.header.robot == before.header.robot
+            assert not {"rate", "gap"} & {finding.kind for finding in check(after).findings}
             known, found = columns_at(before, 5, 10), columns_at(after, 1, 10)
             found |= {name: after.columns()[name] for name in found if "/state/" in name}  # 20 Hz, too
             for name, values in known.items():
