@@ -29,8 +29,8 @@ from controller.types import Array
 from studio.channels import Latest
 from studio.collections import Collection
 from studio.curves import Curves, Spread, Timeline
-from studio.http_wire import CollectionDetails, Details, Health, Page, TaskInfo
-from studio.index import EpisodeRow, Filters
+from studio.http_wire import CollectionDetails, Details, Graded, Health, Page, TaskInfo
+from studio.index import Amount, EpisodeRow, Filters
 from studio.lease import Standing
 from studio.messages import ArmFrame, Command, Notice, Status, builtins
 
@@ -117,6 +117,18 @@ class Client:
 
     def facets(self, **filters: Unpack[Filters]) -> dict[str, dict[str, int]]:
         return self._get("/facets", dict[str, dict[str, int]], **filters)
+
+    def amount(self, **filters: Unpack[Filters]) -> Amount:
+        """How many takes match, how long they are together, and how they ended."""
+        return self._get("/amount", Amount, **filters)
+
+    def revision(self) -> str:
+        """Another one after every change of takes and collections; asking is cheap."""
+        return self._get("/revision", dict[str, str])["revision"]
+
+    def thumbnail(self, episode_id: str) -> bytes:
+        """A small JPEG of the front camera in the middle of the first contact."""
+        return self._ask("GET", f"{_take(episode_id)}/thumbnail").content
 
     def episode(self, episode_id: str) -> Details:
         return self._get(_take(episode_id), Details)
@@ -238,6 +250,10 @@ class Client:
         while (found := self._get("/dataset-health", Health, **filters)).unexamined:
             pass
         return found
+
+    def grades(self, *episode_ids: str) -> dict[str, Graded]:
+        """Of those that were examined before."""
+        return self._get("/grades", dict[str, Graded], episode_id=list(episode_ids))
 
     def health_of(self, episode_id: str) -> Health:
         return self._get(f"{_take(episode_id)}/health", Health)

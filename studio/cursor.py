@@ -262,11 +262,16 @@ def _tracks(episode: Episode) -> tuple[ArmTrack, ...]:
                 action_time=times,
                 base_from_target=columns[f"{arm}/applied/base_from_target"],
                 stiffness=stiffness,
-                phases=_spans(state["time"], _touching(force), end),
+                phases=phases_of(state["time"], wrench, end),
                 modes=_spans(times, _mode_names(stiffness, table), end),
             )
         )
     return tuple(tracks)
+
+
+def phases_of(time: Array, wrench: Array, end: float) -> tuple[Span, ...]:
+    """FREE and CONTACT in turn until `end` [s], of (n,) [s] and (n, 6)."""
+    return _spans(time, _touching(np.linalg.norm(wrench[:, :3], axis=1)), end)
 
 
 def _touching(force: Array) -> Array:

@@ -3,30 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query
 from fastapi import Path as InPath
 from starlette.responses import FileResponse, Response
 
-from studio import edits, survey
+from studio import edits
 from studio.api import Studio
 from studio.collections import Collection
 from studio.edits import edits_path
 from studio.episode import Episode
-from studio.health import TakeHealth
+from studio.http_dataset import health_router, page_router
 from studio.http_wire import (
+    REFUSED,
     Asked,
     AskedPage,
     Changes,
     CollectionDetails,
     CollectionIn,
     Details,
-    Health,
     ManyChanges,
     Page,
-    Problem,
     as_json,
     refusals,
 )
@@ -36,12 +34,7 @@ from studio.reading import Reader, columns_arrow, columns_json, columns_npz, jpe
 from studio.ui.remote import Remote
 
 UNCHANGING = {"Cache-Control": "private, max-age=86400, immutable"}  # of recordings, which nobody edits
-PATIENCE = 5.0  # [s] after which a request for the health of many takes answers with those it has
 
-REFUSED: dict[int | str, dict[str, Any]] = {
-    404: {"model": Problem, "description": "There is no such take, column, image or collection"},
-    409: {"model": Problem, "description": "Not now: it is still being recorded, or in use"},
-}
 Number = Annotated[int, InPath(ge=0, le=10**9)]
 Time = Annotated[float, InPath(ge=0, le=1e9, allow_inf_nan=False)]
 
@@ -52,7 +45,8 @@ def takes_router(studio: Studio, remote: Remote, reader: Reader) -> APIRouter:
     router.include_router(_catalog_router(studio, remote), tags=["takes"])
     router.include_router(_content_router(studio, reader), tags=["content of takes"])
     router.include_router(_collections_router(studio), tags=["collections"])
-    router.include_router(_health_router(studio, reader), tags=["health"])
+    router.include_router(health_router(studio, reader), tags=["health"])
+    router.include_router(page_router(studio, reader), tags=["dataset page"])
     return router
 
 
@@ -253,37 +247,3 @@ def _collections_router(studio: Studio) -> APIRouter:
             return as_json(studio.restore_collection(name))
 
     return router
-
-
-def _health_router(studio: Studio, reader: Reader) -> APIRouter:
-    router, catalog = APIRouter(), studio.catalog
-
-    @router.get("/episodes/{episode_id}/health", response_model=Health)
-    def grade_episode(episode_id: str) -> Response:
-        """What is wrong with a take, and its grade."""
-        with refusals():
-            row = catalog.get(episode_id)
-            told = reader.read(survey.examine, studio.data_dir, row)
-        return as_json(_health([(row, told)], 0))
-
-    @router.get("/dataset-health", response_model=Health)
-    def grade_all(asked: Asked) -> Response:
-        """What is wrong with the matching takes, each and together.
-
-        Those that nobody examined yet may need several requests: `unexamined` says how many wait.
-        """
-        deadline, told = time.monotonic() + PATIENCE, []
-        with refusals():
-            rows = catalog.episodes(limit=None, **asked.filters())
-            for row in rows:
-                told.append((row, reader.read(survey.examine, studio.data_dir, row)))
-                if time.monotonic() > deadline:
-                    break
-        return as_json(_health(told, len(rows) - len(told)))
-
-    return router
-
-
-def _health(takes: list[tuple[EpisodeRow, TakeHealth]], unexamined: int) -> Health:
-    together = survey.survey(takes)
-    return Health(together, {told.episode_id: told.grade for told in together.takes}, unexamined)

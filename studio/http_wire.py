@@ -17,7 +17,7 @@ from studio.catalog import InUseError, NotFinishedError
 from studio.collections import Change, Collection
 from studio.edits import Edit, Outcome, Segment
 from studio.episode import EpisodeError, Event
-from studio.health import Grade
+from studio.health import Finding, Grade
 from studio.index import SORTS, EpisodeRow, Filters
 from studio.jobs.queue import JobBusyError
 from studio.lease import NotDriving
@@ -72,6 +72,7 @@ class Changes(Body):
     remove_segments: list[Name] = []
     clear: list[Name] = []
     undo: Name | None = None
+    edit_id: Annotated[str, Field(pattern=r"^[\w-]{1,64}$")] | None = None  # a name for it, to undo it by
 
     def fields(self) -> dict[str, Any]:
         """For `studio.edits.Edit`."""
@@ -135,6 +136,12 @@ class ViewIn(Body):
     speed: Annotated[float, Field(ge=0, le=16, allow_inf_nan=False)] = 0.0  # 0 stands still
 
 
+class EpisodeIds(Body):
+    """Some takes."""
+
+    episode_ids: Annotated[list[Name], Field(min_length=1, max_length=MOST)]
+
+
 @dataclass(frozen=True, slots=True)
 class Page:
     """Some of the takes that match."""
@@ -175,6 +182,14 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
+class Graded:
+    """What is wrong with a take that was examined."""
+
+    grade: Grade
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class TaskInfo:
     """A task that can be chosen."""
 
@@ -183,6 +198,12 @@ class TaskInfo:
     arms: dict[str, list[str]]  # stiffness modes of each
     cameras: list[str]
     time_limit: float  # [s]
+
+
+REFUSED: dict[int | str, dict[str, Any]] = {
+    404: {"model": Problem, "description": "There is no such take, column, image or collection"},
+    409: {"model": Problem, "description": "Not now: it is still being recorded, or in use"},
+}
 
 
 def as_json(value: Any, status: int = 200) -> Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ RARE = 0.1  # share of the takes in the emptiest third of a range
 MANY_POOR, MANY_FAIR = 0.1, 0.25  # share of takes that are poor, or not good
 
 
+_Kept = tuple[list[int], TakeHealth]  # stamp of the recording, and what was found
+
+
 @dataclass(frozen=True, slots=True)
 class Spread:
     """Where something was at the start of the takes of a task."""
@@ -49,28 +53,55 @@ class DatasetHealth:
     takes: tuple[TakeHealth, ...]  # as trimmed
 
 
-def examine(data_dir: Path, row: EpisodeRow) -> TakeHealth:
-    """The health of one recording, from a file in DATA/cache/health where it was examined before."""
-    kept = data_dir / "cache" / "health" / f"{row.episode_id}.json"
-    status = row.path.stat()
-    stamp = [health.VERSION, status.st_mtime_ns, status.st_size]
+def examined(data_dir: Path, row: EpisodeRow) -> TakeHealth | None:
+    """The health of one recording, where it was examined before: DATA/cache/health keeps it."""
     try:
-        old_stamp, told = msgspec.json.decode(kept.read_bytes(), type=tuple[list[int], TakeHealth])
-        if old_stamp == stamp:
-            return told
+        stamp, told = msgspec.json.decode(_place(data_dir, row).read_bytes(), type=_Kept)
     except (OSError, msgspec.DecodeError):
-        pass
+        return None
+    return told if stamp == _stamp(row.path) else None
+
+
+def examine(data_dir: Path, row: EpisodeRow) -> TakeHealth:
+    """The health of one recording; one that nobody examined yet is read whole."""
+    if (known := examined(data_dir, row)) is not None:
+        return known
+    stamp, place = _stamp(row.path), _place(data_dir, row)
     try:
         with open_episode(row.path) as episode:
             told = health.check(episode)
     except (EpisodeError, ValueError) as error:
         fault = Finding("unreadable", "fault", f"It cannot be read: {error}")
         return TakeHealth(row.episode_id, row.duration, {}, 0.0, (fault,), "", {})
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    part = kept.with_suffix(".part")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    part = place.with_suffix(".part")
     part.write_bytes(msgspec.json.encode((stamp, told)))
-    part.rename(kept)
+    part.rename(place)
     return told
+
+
+def examine_some(data_dir: Path, rows: Sequence[EpisodeRow], patience: float) -> list[TakeHealth]:
+    """As many takes of a list, from its beginning, as can be read anew in `patience` [s]; at least one."""
+    found: list[TakeHealth] = []
+    for row in rows:
+        known = examined(data_dir, row)
+        if known is None:
+            if patience <= 0:
+                break
+            begin = time.monotonic()
+            known = examine(data_dir, row)
+            patience -= time.monotonic() - begin
+        found.append(known)
+    return found
+
+
+def _place(data_dir: Path, row: EpisodeRow) -> Path:
+    return data_dir / "cache" / "health" / f"{row.episode_id}.json"
+
+
+def _stamp(path: Path) -> list[int]:
+    status = path.stat()
+    return [health.VERSION, status.st_mtime_ns, status.st_size]
 
 
 def survey(takes: Sequence[tuple[EpisodeRow, TakeHealth]]) -> DatasetHealth:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from studio.commands.terminal import DATA, Data, EpisodeId, Json, console, encode, print_json, table_of
+from studio.index import Filters
 
 
 def episodes(
@@ -97,33 +98,59 @@ def show(episode_id: Positional[EpisodeId], data: Data = DATA, json: Json = Fals
 
 
 def annotate(
-    episode_id: Positional[EpisodeId],
+    ids: Positional[tuple[Annotated[str, arg(metavar="ID")], ...]] = (),
     outcome: Literal["success", "failure", "unmarked"] | None = None,
     quality: int | None = None,
     note: str | None = None,
     add_flags: tuple[str, ...] = (),
     remove_flags: tuple[str, ...] = (),
     trim: tuple[float, float] | None = None,
+    of_task: str | None = None,
+    of_operator: str | None = None,
+    of_agent: str | None = None,
+    of_outcome: Literal["success", "failure", "unmarked"] | None = None,
+    of_min_quality: int | None = None,
+    of_flags: tuple[str, ...] = (),
+    of_text: str | None = None,
     author: str | None = None,
     data: Data = DATA,
     json: Json = False,
 ) -> int:
-    """Say something about an episode; what was said before is kept.
+    """Say something about episodes, about all of them or none; what was said before is kept.
 
     Args:
+        ids: These episodes; else all that the options of-... ask for.
         quality: 1 poor .. 5 excellent.
         trim: In and out point in seconds; the recording is not cut.
+        of_text: Words in id, note, instruction or people.
         author: Who says so; your user name if not given.
     """
     from studio.api import Studio
 
-    changes: dict[str, Any] = {"outcome": outcome, "quality": quality, "note": note, "trim": trim}
-    changes |= {"add_flags": add_flags, "remove_flags": remove_flags}
+    given: dict[str, Any] = {"outcome": outcome, "quality": quality, "note": note, "trim": trim}
+    given |= {"add_flags": add_flags, "remove_flags": remove_flags}
+    changes = {name: value for name, value in given.items() if value not in (None, ())}
+    filters: Filters = {
+        "task": of_task,
+        "operator": of_operator,
+        "agent": of_agent,
+        "outcome": of_outcome,
+        "min_quality": of_min_quality,
+        "flags": of_flags or None,
+        "text": of_text,
+    }
+    if bool(ids) == any(filters.values()):
+        raise ValueError("Name some episodes, or ask for them by --of-task and the like: one of the two.")
     with Studio(data) as studio:
-        row = studio.annotate(
-            episode_id, author=author, **{name: v for name, v in changes.items() if v not in (None, ())}
-        )
-    print_json(row) if json else console.print(f"{row.episode_id}: {row.outcome}, quality {row.quality}")
+        chosen = ids or [row.episode_id for row in studio.episodes(**filters)]
+        rows = studio.annotate_all(chosen, author=author, **changes)
+    if json:
+        print_json(rows[0] if len(ids) == 1 else rows)
+        return 0
+    for row in rows:
+        console.print(f"{row.episode_id}: {row.outcome}, quality {row.quality}")
+    if not rows:
+        console.print("No episode matches; nothing was changed.")
     return 0
 
 
