@@ -1,4 +1,4 @@
-"""What the dataset page lives on: pictures, sums, grades, revisions, edits of many takes and their undoing."""
+"""What the dataset page lives on: pictures, sums, grades, revisions, edits of many takes, undone too."""
 
 from __future__ import annotations
 
