@@ -35,7 +35,7 @@ from torch import Tensor, nn
 
 from policy.config import TrainConfig
 from policy.features import Encoding, Group
-from policy.vision import ResNet18, SmallCnn
+from policy.vision import KeypointCnn, ResNet18, SmallCnn
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet, as torchvision's weights expect
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -81,8 +81,7 @@ class Act(nn.Module):
         n_wrench = encoding.n_arms * 6
 
         if self.n_cameras:
-            frozen = bool(config.backbone_weights)
-            self.vision = SmallCnn() if config.backbone == "cnn" else ResNet18(frozen)
+            self.vision = _vision(config)
             self.image_token = nn.Conv2d(self.vision.width, d, 1)
             self.camera = nn.Parameter(torch.randn(self.n_cameras, 1, d) * 0.02)
         self.state_token = nn.Linear(encoding.state_width, d)
@@ -148,7 +147,7 @@ class Act(nn.Module):
         self, batch: Batch, latent: Tensor, hide_images: bool = False, hide_wrench: bool = False
     ) -> Tensor:
         state = batch.state
-        if self.training and self.state_dropout:
+        if self.training and self.n_cameras:
             state = state * (torch.rand(len(state), 1, device=state.device) >= self.state_dropout)
         tokens = [self.state_token(state)[:, None]]
         if self.has_wrench:
@@ -316,6 +315,12 @@ class FeedForward(nn.Sequential):
             nn.Dropout(config.dropout),
             nn.Linear(config.feedforward, config.width),
         )
+
+
+def _vision(config: TrainConfig) -> KeypointCnn | SmallCnn | ResNet18:
+    if config.backbone == "resnet18":
+        return ResNet18(frozen=bool(config.backbone_weights))
+    return KeypointCnn() if config.backbone == "keypoints" else SmallCnn()
 
 
 _AS_IT_IS = [nn.Identity()] * 3

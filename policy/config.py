@@ -44,8 +44,9 @@ class TrainConfig:
     """What a chunk holds past the end of its take: the last action, or nothing that counts."""
 
     # Network
-    backbone: Literal["cnn", "resnet18"] = "cnn"
-    """What reads the images: a small network of our own, or ResNet-18."""
+    backbone: Literal["keypoints", "cnn", "resnet18"] = "keypoints"
+    """What reads the images: a small network that tells where things are, one that gives a grid of tokens, or
+    ResNet-18."""
     backbone_weights: str = ""
     """File with torchvision's ResNet-18 weights (.pth or .safetensors); without, it learns from nothing."""
     width: int = 128
@@ -55,8 +56,8 @@ class TrainConfig:
     decoder_layers: int = 2
     pre_norm: bool = True
     dropout: float = 0.1
-    state_dropout: float = 0.0
-    """Share of the samples that are learned without the arm's state, so that images have to tell."""
+    state_dropout: float = 0.5
+    """Share of the samples that are learned without the arm's state, so that images, if any, have to tell."""
     cvae: bool = False
     """Learn a latent for what the observation does not tell; zero when the policy runs."""
     cvae_layers: int = 2
@@ -168,6 +169,7 @@ PRESETS: dict[Preset, TrainConfig] = {
         encoder_layers=4,
         decoder_layers=7,
         pre_norm=False,
+        state_dropout=0.0,
         cvae=True,
         cvae_layers=4,
         rotation_weight=1.0,

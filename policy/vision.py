@@ -1,6 +1,6 @@
-"""Image encoders: a small CNN that learns from nothing, and ResNet-18 that reads torchvision's weights.
+"""Image encoders: two small CNNs that learn from nothing, and ResNet-18 that reads torchvision's weights.
 
-Both take (n, 3, h, w) in channels-last memory and give (n, `width`, h', w'). Normalisation is by groups,
+All take (n, 3, h, w) in channels-last memory and give (n, `width`, h', w'). Normalisation is by groups,
 which does not depend on the batch, or frozen, where weights trained elsewhere bring their own statistics.
 """
 
@@ -40,6 +40,37 @@ class SmallCnn(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         out: Tensor = self.blocks(F.relu(self.norm1(self.conv1(images))))
         return out
+
+
+class KeypointCnn(nn.Module):
+    """Where in the image `n_points` learned features are: each the centre of a softmax over its map.
+
+    A place is told by numbers that move with it, so few demonstrations teach where to go: tokens of a grid
+    have to learn each place anew. Spatial softmax of Levine et al. 2016 (arXiv 1504.00702), on maps of a
+    quarter of the image's height and width.
+    """
+
+    def __init__(self, n_points: int = 32, stem: int = 24) -> None:
+        super().__init__()
+        self.width = 2 * n_points
+        self.conv1 = nn.Conv2d(3, stem, 5, stride=2, padding=2, bias=False)
+        self.norm1 = _group_norm(stem)
+        self.blocks = nn.Sequential(
+            BasicBlock(stem, stem, 2, _group_norm), BasicBlock(stem, 2 * stem, 1, _group_norm)
+        )
+        self.maps = nn.Conv2d(2 * stem, n_points, 1, bias=False)  # the softmax would cancel one
+        self.sharpness = nn.Parameter(torch.zeros(n_points))  # log of what maps are multiplied by
+        _initialise(self)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(n, 2 n_points, 1, 1): x of all points, then y, from -1 to 1 across the image."""
+        maps = self.maps(self.blocks(F.relu(self.norm1(self.conv1(images)))))  # (n, points, h, w)
+        sharp = maps * self.sharpness.exp()[:, None, None]
+        shares = sharp.flatten(2).softmax(-1).unflatten(2, maps.shape[2:])
+        x = torch.linspace(-1.0, 1.0, maps.shape[3], device=maps.device)
+        y = torch.linspace(-1.0, 1.0, maps.shape[2], device=maps.device)
+        points = torch.cat(((shares.sum(2) * x).sum(-1), (shares.sum(3) * y).sum(-1)), dim=1)
+        return points[..., None, None]
 
 
 class ResNet18(nn.Module):

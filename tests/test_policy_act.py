@@ -12,9 +12,11 @@ from safetensors.torch import save_file
 from policy.act import Act, Batch
 from policy.config import PRESETS, TrainConfig
 from policy.features import Encoding
-from policy.vision import ResNet18
+from policy.vision import KeypointCnn, ResNet18
 
-TINY = TrainConfig(width=16, feedforward=32, heads=2, chunk_seconds=0.5, dropout=0.0, latent=4)
+TINY = TrainConfig(
+    width=16, feedforward=32, heads=2, chunk_seconds=0.5, dropout=0.0, state_dropout=0.0, latent=4
+)
 B, SIZE = 3, 32
 
 
@@ -46,6 +48,7 @@ SWITCHES = {
     "joints": {"policy": "act"},
     "joints without wrench": {"policy": "act", "wrench": False},
     "norm after": {"pre_norm": False},
+    "grid": {"backbone": "cnn"},
     "resnet": {"backbone": "resnet18"},
     "paper's action": {"rotation": "axis-angle", "stiffness": "cholesky", "frame": "absolute"},
 }
@@ -133,9 +136,27 @@ def test_a_running_policy_has_no_chance_in_it() -> None:
     assert torch.equal(model(batch), model(batch))
 
 
-def test_small_has_about_a_million_parameters() -> None:
-    model, _ = built(TrainConfig())
-    assert 0.7e6 < sum(p.numel() for p in model.parameters()) < 1.2e6
+@pytest.mark.parametrize(("backbone", "millions"), [("keypoints", 0.76), ("cnn", 0.9), ("resnet18", 11.8)])
+def test_a_small_policy_stays_small(backbone: str, millions: float) -> None:
+    model, _ = built(TrainConfig(backbone=backbone))
+    assert sum(p.numel() for p in model.parameters()) / 1e6 == pytest.approx(millions, rel=0.05)
+
+
+def test_points_move_with_what_they_mark() -> None:
+    torch.manual_seed(0)
+    model = KeypointCnn()
+    model.sharpness.data.fill_(8.0)  # a point is then where its map is highest
+    images = torch.zeros(2, 3, 64, 96)
+    images[0, :, 20:28, 32:40] = 4.0
+    images[1, :, 28:36, 48:56] = 4.0
+    points = model(images)[..., 0, 0].unflatten(1, (2, 32))
+    assert points.abs().max() <= 1.0
+    x, y = points[1] - points[0]
+    marks = (x != 0) | (y != 0)  # the others are drawn to the border
+    assert marks.sum() >= 8
+    # 16 of 96 and 8 of 64 pixels are 4 of 24 and 2 of 16 cells, whose centres run from -1 to 1.
+    torch.testing.assert_close(x[marks], torch.full_like(x[marks], 2 * 4 / 23), atol=0.01, rtol=0)
+    torch.testing.assert_close(y[marks], torch.full_like(y[marks], 2 * 2 / 15), atol=0.01, rtol=0)
 
 
 def test_resnet_reads_torchvisions_file(tmp_path: Path) -> None:
@@ -196,17 +217,21 @@ def test_half_precision_gives_nearly_the_same_loss_in_whole_precision() -> None:
 
 
 def test_a_share_of_the_samples_is_learned_without_the_state() -> None:
-    model, encoding = built(dataclasses.replace(TINY, state_dropout=0.5, images=False))
+    model, encoding = built(dataclasses.replace(TINY, state_dropout=0.5), n_cameras=1)
     torch.manual_seed(1)
-    n, config = 64, TINY
-    wrench, images = torch.randn(n, config.wrench_history, 6), torch.zeros(n, 0, 1, 1, 3)
-    told = []
-    for _ in range(2):
-        batch = Batch(torch.randn(n, encoding.state_width), wrench, images)
-        torch.manual_seed(2)
-        told.append(model(batch))
-    same = torch.isclose(*told, atol=1e-6).all((1, 2)).sum().item()
-    assert 16 < same < 48
-    model.eval()
-    batch, other = (Batch(torch.randn(n, encoding.state_width), wrench, images) for _ in range(2))
-    assert not torch.isclose(model(batch), model(other), atol=1e-6).all((1, 2)).any()
+    n = 64
+    wrench = torch.randn(n, TINY.wrench_history, 6)
+    images = torch.zeros(n, 1, 16, 16, 3, dtype=torch.uint8)
+    batches = [Batch(torch.randn(n, encoding.state_width), wrench, images) for _ in range(2)]
+
+    def same(model: Act) -> int:
+        told = []
+        for batch in batches:
+            torch.manual_seed(2)
+            told.append(model(batch))
+        return int(torch.isclose(*told, atol=1e-6).all((1, 2)).sum())
+
+    assert 16 < same(model) < 48
+    assert same(model.eval()) == 0
+    blind, _ = built(dataclasses.replace(TINY, state_dropout=0.5, images=False))
+    assert same(blind) == 0  # the state is all it has

@@ -184,7 +184,9 @@ train(shared_config(2), Dataset(Path({cache!r})), Path({run!r}))
 
 def shared_config(batch: int) -> TrainConfig:
     # Chance that is drawn per process (dropout, latent) is switched off; augmentation is drawn per sample.
-    return dataclasses.replace(TINY, batch=batch, dropout=0.0, past_end="mask", steps=4, threads=1)
+    return dataclasses.replace(
+        TINY, batch=batch, dropout=0.0, state_dropout=0.0, past_end="mask", steps=4, threads=1
+    )
 
 
 def test_two_processes_equal_one_with_the_double_batch(tmp_path: Path, dataset: Dataset) -> None:
