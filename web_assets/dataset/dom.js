@@ -29,6 +29,7 @@ export function toast(text, { kind = "note", action = null } = {}) {
   if (action) box.append(h("button", { onclick: () => { leave(); action.act(); } }, action.label));
   box.append(h("button", { class: "close", "aria-label": "Dismiss", onclick: leave }, "×"));
   const all = document.getElementById("toasts");
+  if (kind === "edit") all.querySelector(".edit")?.remove(); // the newest edit is what one would undo
   all.append(box);
   while (all.children.length > 3) all.firstChild.remove();
   setTimeout(leave, kind === "bad" ? 2 * SHOWN : SHOWN);

@@ -1,0 +1,59 @@
+// How sound takes are: a grade with its reasons for all of them together, and for each.
+
+import { ask } from "./dialogs.js";
+import { attempt, h } from "./dom.js";
+import * as format from "./format.js";
+
+const MOST = 200; // takes with findings that are listed
+
+// `examine()` asks the studio until nothing is left to examine; `open(id)` shows a take.
+export function show(words, examine, { onGrades, open }) {
+  let isOpen = true;
+  const content = h("div", { class: "health" }, h("p", { class: "dim" }, "Examining…"));
+  const dialog = ask(`Health of ${words}`, content, { kind: "wide", onClose: () => { isOpen = false; } });
+  attempt(async () => {
+    while (isOpen) {
+      const { together, unexamined } = await examine();
+      onGrades(together.takes);
+      draw(content, together, unexamined, (id) => { dialog.close(); open(id); });
+      if (!unexamined) return;
+    }
+  });
+}
+
+function draw(content, together, unexamined, open) {
+  const takes = together.takes.filter(({ findings }) => findings.length);
+  const worst = (found) => Math.max(...found.findings.map(({ severity }) => ["note", "warning", "fault"].indexOf(severity)));
+  takes.sort((a, b) => worst(b) - worst(a));
+  const n = together.takes.length;
+  content.replaceChildren(
+    unexamined ? h("p", { class: "progress" }, h("progress", { max: n + unexamined, value: n }), ` ${format.count(n)} of ${format.takes(n + unexamined)} examined`) : "",
+    h("p", { class: "verdict" }, h("b", { class: `grade ${together.grade}` }, `● ${together.grade}`),
+      ` ${together.reasons.join(" ") || "Nothing speaks against these takes."}`),
+    h("div", { class: "shares" },
+      shares("Grades", Object.fromEntries(format.GRADES.map((grade) => [grade, together.grades[grade]]).filter(([, k]) => k))),
+      ...Object.entries(together.balance).map(([name, counts]) => shares({ agent: "Driven by" }[name] ?? name, counts))),
+    notes(together.findings.filter(({ severity }) => severity === "note")),
+    takes.length ? h("table", {}, takes.slice(0, MOST).map((found) => line(found, open))) : h("p", { class: "dim" }, "Every take is sound."),
+    takes.length > MOST ? h("p", { class: "dim" }, `… and ${takes.length - MOST} more.`) : "",
+  );
+}
+
+function notes(findings) {
+  return findings.length ? h("ul", { class: "dim" }, findings.map(({ text }) => h("li", {}, text))) : "";
+}
+
+function shares(title, counts) {
+  const sum = Object.values(counts).reduce((a, b) => a + b, 0);
+  return h("section", {}, h("h3", {}, title), Object.entries(counts).slice(0, 8).map(([value, n]) => h("div", { class: "share" },
+    h("i", { class: value, style: { width: `${(100 * n) / sum}%` } }), h("span", {}, value), h("small", {}, `${format.count(n)} · ${format.percent(n / sum)}`))));
+}
+
+function line({ episode_id: id, findings }, open) {
+  const severities = findings.map(({ severity }) => severity);
+  const grade = severities.includes("fault") ? "poor" : severities.includes("warning") ? "fair" : "good";
+  return h("tr", {},
+    h("td", {}, h("span", { class: `grade ${grade}`, title: grade }, "●")),
+    h("td", {}, h("button", { type: "button", class: "link", onclick: () => open(id) }, id)),
+    h("td", {}, findings.map(({ text, severity }) => h("div", { class: severity }, text))));
+}
