@@ -33,7 +33,7 @@ MENU = 5  # index of the button that engages
 
 
 def measure() -> dict[str, float]:
-    """Latency alone and while another client downloads scenes and forces, then the processors' time.
+    """Latency alone and while another client downloads a take, its films and scenes; the processors' time.
 
     Latency is from sending a pose to the control period that requests it, by the wall clock of the take that
     is recorded meanwhile. The cost is what server and session process use for more frames, with both clutches
@@ -57,7 +57,7 @@ def measure() -> dict[str, float]:
 def _measure(url: str, data: Path, pids: tuple[int, int]) -> dict[str, float]:
     with Headset(url) as headset, Recording(data) as recording:
         quiet = _latency(headset, recording)
-        with Downloads(url):
+        with Downloads(url, recording.last_take):
             busy = _latency(headset, recording)
         headset.engage()
         cost = _cost_of_frames(headset, pids)
@@ -163,6 +163,12 @@ class Recording:
         assert status is not None
         return status
 
+    @property
+    def last_take(self) -> str:
+        """Its id."""
+        assert self.status.last_take is not None
+        return Path(self.status.last_take.path).stem
+
     def start(self) -> None:
         self._remote.post(StartTake(countdown=0.0))
         _wait(lambda: self.status.phase == "recording")
@@ -179,24 +185,33 @@ class Recording:
 
 
 class Downloads:
-    """Somebody else who fetches whatever is large, again and again."""
+    """Somebody else who fetches whatever is large, again and again: columns, films, scene, page."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, take: str) -> None:
         program = (
             "import httpx, itertools, sys\n"
-            "parts = [p for p in httpx.get(sys.argv[1] + sys.argv[2], timeout=60).json()['parts'] if p]\n"
-            "for part in itertools.cycle([*parts, '/']):\n"
-            "    httpx.get(sys.argv[1] + part, timeout=60)\n"
+            "url, task, take = sys.argv[1:]\n"
+            "get = lambda path: httpx.get(url + path, timeout=120).raise_for_status()\n"
+            "parts = [part for part in get(f'/xr/scene/{task}').json()['parts'] if part]\n"
+            "httpx.post(f'{url}/api/v1/refresh').raise_for_status()\n"
+            "episode = f'/api/v1/episodes/{take}'\n"
+            "films = [f'{episode}/video/{camera}.mp4' for camera in get(f'{episode}/images').json()]\n"
+            "columns = [f'{episode}/columns?format={format}' for format in ('npz', 'json')]\n"
+            "for path in itertools.cycle([*columns, *films, *parts, '/']):\n"
+            "    get(path)\n"
         )
-        self._process = subprocess.Popen([sys.executable, "-c", program, url, f"/xr/scene/{TASK}"])
+        self._process = subprocess.Popen([sys.executable, "-c", program, url, TASK, take])
 
     def __enter__(self) -> Self:
         time.sleep(2.0)
         return self
 
     def __exit__(self, *_: object) -> None:
+        ended = self._process.poll()
         self._process.kill()
         self._process.wait()
+        if ended is not None:
+            raise RuntimeError(f"The downloads stopped by themselves: {ended}.")
 
 
 def _latency(headset: Headset, recording: Recording) -> tuple[Array, float]:
