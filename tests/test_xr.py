@@ -246,6 +246,12 @@ def test_buttons_come_in_the_standard_order() -> None:
     assert page.show(right=HAND | {"buttons": [0, 1, 0, 0, 0, 1]}) == [m.SwitchMode(arm=0)]
 
 
+def test_a_wand_takes_hold_by_its_pad() -> None:
+    page, wand = Page(), HAND | {"buttons": [0.0] * 3}  # its menu button never reaches a page
+    page.show(right=wand)
+    assert page.show(right=wand | {"buttons": [0, 0, 1]}) == [m.Clutch(arm=0)]
+
+
 def test_bare_hands_and_guesses_are_not_believed() -> None:
     page = Page()
     page.show(right=HAND)

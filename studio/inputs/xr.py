@@ -30,6 +30,8 @@ Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]
 # xr-standard: trigger, squeeze, touchpad, thumbstick, then A or X, B or Y. Menu and Meta buttons never reach
 # a page, so B and Y stand in for the paper's menu button.
 STANDARD: tuple[Button, ...] = ("trigger", "squeeze", "pad", "stick", "primary", "menu")
+# A Vive wand has no more than these for a page (WebXR input profile `htc-vive`); its pad stands in.
+WAND: tuple[Button, ...] = ("trigger", "squeeze", "menu")
 
 AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # ours to WebXR's
 XR_FROM_OURS = quaternion_of(AXES)
@@ -194,7 +196,8 @@ class WebXr:
         hands: dict[Side, Controller] = {}
         for side, hand in (("left", frame.left), ("right", frame.right)):
             if hand is not None and self._is_trusted(side, hand):  # type: ignore[arg-type]
-                buttons = dict(zip(STANDARD, hand.buttons, strict=False))
+                names = WAND if len(hand.buttons) <= len(WAND) else STANDARD
+                buttons = dict(zip(names, hand.buttons, strict=False))
                 hands[side] = Controller(pose_of(hand.pose), buttons)  # type: ignore[index]
         moment = Moment(now - self.latency, self.latency, self.jitter)
         self.controllers.update(hands, head, moment, status)
