@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal, Protocol
 
 from fastapi import APIRouter, Query, Request
@@ -29,16 +28,8 @@ At = Annotated[float | None, Query(ge=0, le=1e9, allow_inf_nan=False)]
 class Views(Protocol):
     """The 3-D views that are open, whoever they belong to."""
 
-    def show(
-        self,
-        key: str,
-        person: PersonId,
-        episode_ids: Sequence[str],
-        shifts: Sequence[float],
-        time: float,
-        speed: float,
-    ) -> None:
-        """Raise KeyError where this person has no view of that key."""
+    def show_in(self, person: PersonId, asked: ViewIn) -> None:
+        """Raise KeyError where this person has no such view."""
 
 
 def view_router(studio: Studio, reader: Reader, views: Views | None) -> APIRouter:
@@ -103,7 +94,7 @@ def view_router(studio: Studio, reader: Reader, views: Views | None) -> APIRoute
         with refusals():
             if views is None:
                 raise KeyError("This studio has no 3-D view.")
-            views.show(body.view, person_of(request), body.episode_ids, body.shifts, body.time, body.speed)
+            views.show_in(person_of(request), body)
         return Response(status_code=204)
 
     return router

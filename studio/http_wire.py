@@ -134,6 +134,7 @@ class ViewIn(Body):
     shifts: list[Shift] = []  # [s] that each take, but the first, is ahead of the first one's time
     time: Seconds = 0.0  # [s] in the first one
     speed: Annotated[float, Field(ge=0, le=16, allow_inf_nan=False)] = 0.0  # 0 stands still
+    bar: bool = False  # open the first take as the Episodes tab does, with its own bar
 
 
 class EpisodeIds(Body):

@@ -89,7 +89,7 @@ def open_site(
             reception=gate.receive,
         )
         add_xr(app, page.remote, lambda socket: gate.lease.sit(person_of(socket), "headset"), page.model)
-        stack.callback(add_api(app, studio, page.remote, gate.lease).close)
+        stack.callback(add_api(app, studio, page.remote, gate.lease, page.views).close)
         front = FrontServer(app, host, port, token=token, certificate=certificate)
         stack.enter_context(front)
         yield Site(front, page, certificate)

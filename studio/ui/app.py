@@ -22,6 +22,7 @@ import viser
 
 from controller.types import Pose, Wrench
 from studio.api import Studio
+from studio.lease import PersonId
 from studio.messages import CameraImage, Frame, Notice, Status
 from studio.ui import scene, viser_private
 from studio.ui.control import ControlRows
@@ -104,6 +105,11 @@ class Page:
         self._episodes.close()
         self.remote.close()
 
+    @property
+    def views(self) -> EpisodesTab:
+        """The 3-D views of all who look, for `studio.http_view`."""
+        return self._episodes
+
     def restart_session(self) -> None:
         """Start a new session process, on a thread of its own: recovering a take may take a while."""
         if self._restarting.acquire(blocking=False):  # else somebody else is at it
@@ -157,6 +163,7 @@ class Page:
             model=self.model,
             author=self._author,
             mark=lambda episode_id, is_deleted: self._desk.mark(episode_id, is_deleted=is_deleted),
+            person=self._person,
         )
         with tabs.add_tab("System"):
             self._system = SystemTab(
@@ -172,6 +179,10 @@ class Page:
     def _author(self, client_id: int) -> str:
         seat = self._gate.seat(client_id)
         return seat.words if seat else getpass.getuser()
+
+    def _person(self, client_id: int) -> PersonId | None:
+        seat = self._gate.seat(client_id)
+        return seat.person if seat else None
 
     # Painting
 

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import getpass
 import json
+import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import viser
 
 from studio.catalog import Catalog
+from studio.http_wire import ViewIn
 from studio.index import EpisodeRow
+from studio.lease import PersonId
 from studio.ui.review import Review
 from studio.ui.scene import SceneModel
 from studio.ui.take_card import TakeCard
 from studio.ui.take_list import TakeList
 from studio.ui.viser_private import run_javascript
+
+DATASET_PAGE = (
+    '<div class="dock-row"><button data-dock="/dataset">Dataset page</button>'
+    '<a href="/dataset" target="_blank" rel="noopener">in a tab of its own</a></div>'
+)
 
 
 class EpisodesTab:
@@ -34,11 +43,14 @@ class EpisodesTab:
         model: Callable[[str], SceneModel] | None = None,
         author: Callable[[int], str] = lambda _: getpass.getuser(),
         mark: Callable[[str, bool], None] = lambda _, __: None,
+        person: Callable[[int], PersonId | None] = lambda _: None,
     ) -> None:
         """`model` gives the scene of a task, best always the same one.
 
-        `author` tells who a client is. `mark` hears of takes that are moved to the trash (True) or back.
+        `author` and `person` tell who a client is. `mark` hears of takes that are moved to the trash (True),
+        or back.
         """
+        self._person = person
         self.catalog, self.author, self.mark = catalog, author, mark
         self.model = model or cache(SceneModel)
         self.server, self._tab = server, tab
@@ -60,6 +72,18 @@ class EpisodesTab:
                 with suppress(RuntimeError):  # it has gone meanwhile, and its widgets with it
                     client.takes.show()
 
+    def show_in(self, person: PersonId, asked: ViewIn) -> None:
+        """See `studio.http_view.Views`."""
+        clients = list(self._clients.items())
+        found = [c for client_id, c in clients if c.key == asked.view and self._person(client_id) == person]
+        if not found:
+            raise KeyError("That page is not open any more, or it is somebody else's.")
+        if asked.bar and asked.episode_ids:
+            self.catalog.get(asked.episode_ids[0])  # KeyError, where there is no such take
+            found[0].open(asked.episode_ids[0])
+        else:
+            found[0].follow(asked.episode_ids, asked.shifts, asked.time, asked.speed)
+
     def of(self, client_id: int) -> ClientEpisodes | None:
         """What this client sees; None before it has connected and after it has gone."""
         return self._clients.get(client_id)
@@ -70,8 +94,9 @@ class EpisodesTab:
             client.close()
 
     def _connect(self, client: viser.ClientHandle) -> None:
+        here = client.gui.add_html("")  # on the page whatever tab is open
         with self._tab:
-            episodes = ClientEpisodes(client, self)
+            episodes = ClientEpisodes(client, self, here)
         self._clients[client.client_id] = episodes
         self.show()  # what is known already
         self.refresh()
@@ -87,14 +112,20 @@ class EpisodesTab:
 class ClientEpisodes:
     """One client's list and open take, built into the container that is open; one thing at a time."""
 
-    def __init__(self, client: viser.ClientHandle, everybody: EpisodesTab) -> None:
+    def __init__(self, client: viser.ClientHandle, everybody: EpisodesTab, here: viser.GuiHtmlHandle) -> None:
+        """`here` tells the page's script by which key its view is known, and which take is open."""
         self._client, self._everybody, self._catalog = client, everybody, everybody.catalog
         self._lock = threading.RLock()
         self._deleted: str | None = None  # id of the take that can be brought back
         self.review: Review | None = None
+        self.key = secrets.token_urlsafe(12)
+        self._here = here
+        self._followed: list[str] = []  # takes that another page has shown here
+        self._tell_here()
         gui = client.gui
         self._list_folder = gui.add_folder(None)
         with self._list_folder:
+            gui.add_html(DATASET_PAGE)
             self.takes = TakeList(
                 gui, self._catalog, open_take=self.open, restore=self._restore, look_again=everybody.refresh
             )
@@ -117,6 +148,34 @@ class ClientEpisodes:
                 self._card.gallery,
                 self._card.fail,
             )
+            self._tell_here()
+
+    def follow(self, episode_ids: Sequence[str], shifts: Sequence[float], time: float, speed: float) -> None:
+        """Show in 3-D what the page of the dataset shows; no take, and the live scene is back."""
+        with self._lock:
+            if list(episode_ids) != self._followed and (episode_ids or self._followed):
+                self._follow_others([self._catalog.get(each) for each in episode_ids])
+            if self.review is not None and self._followed:
+                self.review.shifts = [*shifts, *[0.0] * len(episode_ids)][: len(episode_ids)]
+                self.review.playback.follow(time, speed)
+
+    def _follow_others(self, rows: Sequence[EpisodeRow]) -> None:
+        self._leave()
+        self._list_folder.visible, self._card_folder.visible = True, False
+        if rows:
+            first, *others = rows
+            everybody = self._everybody
+            self.review = Review(
+                everybody.server, self._client, first, everybody.model, None, self._tell_failure, others
+            )
+            self._followed = [row.episode_id for row in rows]
+
+    def _tell_failure(self, why: str) -> None:
+        self._client.add_notification("No 3-D view", why, color="orange")
+
+    def _tell_here(self) -> None:
+        shown = self.review.row.episode_id if self.review and not self._followed else ""
+        self._here.content = f'<i class="here" data-view="{self.key}" data-episode="{escape(shown)}"></i>'
 
     def back(self) -> None:
         """To the list and the live scene."""
@@ -184,7 +243,9 @@ class ClientEpisodes:
     def _leave(self) -> None:
         if self.review is not None:
             self.review.close()
-            self.review = None
+            self.review, self._followed = None, []
+            with suppress(RuntimeError):  # its client may have gone
+                self._tell_here()
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
@@ -198,7 +259,8 @@ class ClientEpisodes:
 
 
 def page_script() -> str:
-    """What the page needs besides viser's own: keys and looks of a review."""
+    """What the page needs besides viser's own: keys and looks of a review, and our other pages beside it."""
     folder = Path(__file__).parents[2] / "web_assets"
-    style = json.dumps((folder / "review.css").read_text())
-    return (folder / "review.js").read_text().replace("REVIEW_CSS", style)
+    review, dock = (json.dumps((folder / f"{name}.css").read_text()) for name in ("review", "dock"))
+    scripts = [(folder / f"{name}.js").read_text() for name in ("review", "dock")]
+    return "\n".join(scripts).replace("REVIEW_CSS", review).replace("DOCK_CSS", dock)

@@ -155,9 +155,11 @@ class WrenchMark:
 class Ghost:
     """The hand at the target, translucent. The tool trails it by the press; where both agree it vanishes."""
 
-    def __init__(self, scene: viser.SceneApi, path: str, palm: Mesh) -> None:
+    def __init__(self, scene: viser.SceneApi, path: str, palm: Mesh, color: Rgb | None = None) -> None:
+        """Without a `color` of its own it has that of the level."""
         self.path = path
         self._scene = scene
+        self._color = color
         self._root = scene.add_frame(path, show_axes=False, visible=False)
         self._parts: list[viser.MeshHandle] = []
         self._level: Level = "ok"
@@ -169,7 +171,7 @@ class Ghost:
             path,
             mesh.vertices,
             mesh.faces,
-            color=LEVEL_COLORS["ok"],
+            color=self._color or LEVEL_COLORS["ok"],
             opacity=GHOST_OPACITY,
             flat_shading=True,
             cast_shadow=False,
@@ -178,16 +180,16 @@ class Ghost:
         self._parts.append(part)
         return part
 
-    def show(self, world_from_ghost: Pose | None, world_from_real: Pose, level: Level) -> None:
-        """Put the ghost at its target; None hides it."""
-        self._root.visible = world_from_ghost is not None and self._is_apart(
-            world_from_ghost, world_from_real
+    def show(self, world_from_ghost: Pose | None, world_from_real: Pose | None, level: Level) -> None:
+        """Put the ghost at its target; None hides it. Without a real hand it is always seen."""
+        self._root.visible = world_from_ghost is not None and (
+            world_from_real is None or self._is_apart(world_from_ghost, world_from_real)
         )
         if world_from_ghost is None or not self._root.visible:
             return
         self._root.position = coarse(world_from_ghost.position)
         self._root.wxyz = coarse(world_from_ghost.wxyz)
-        if level != self._level:
+        if level != self._level and self._color is None:
             self._level = level
             for part in self._parts:
                 part.color = LEVEL_COLORS[level]
@@ -223,11 +225,12 @@ class WorkspaceMark:
 
 
 class Trail:
-    """Where a tool has been, coloured by what it felt."""
+    """Where a tool has been, coloured by what it felt, or in a `color` of its own."""
 
-    def __init__(self, scene: viser.SceneApi, path: str) -> None:
+    def __init__(self, scene: viser.SceneApi, path: str, color: Rgb | None = None) -> None:
         self._scene = scene
         self._path = path
+        self._color = color
         self._lines: viser.LineSegmentsHandle | None = None
 
     def show(self, points: Array, newtons: Array | None) -> None:
@@ -239,7 +242,8 @@ class Trail:
             return
         keep = np.unique(np.linspace(0, len(points) - 1, TRAIL_POINTS).round().astype(int))
         points = points[keep] + np.array([0.0, 0.0, TRAIL_LIFT])
-        colors = _unmanaged(force_color(np.zeros(len(keep)) if newtons is None else newtons[keep]))
+        felt = force_color(np.zeros(len(keep)) if newtons is None else newtons[keep])
+        colors = _unmanaged(felt if self._color is None else np.tile(np.array(self._color), (len(keep), 1)))
         self._lines = self._scene.add_line_segments(
             self._path,
             np.stack((points[:-1], points[1:]), axis=1).astype(_FLOAT),

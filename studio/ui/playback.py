@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 FRAME = 1 / 25  # [s] of real time between two drawings while playing
 SETTLE = 0.3  # [s] after the last drawing comes one more: the board's picture is sent only so often
+APART = 0.1  # [s] by which two clocks may differ that go on together
 
 
 class Playback:
@@ -53,6 +54,18 @@ class Playback:
         with self._changed:
             self.is_playing = False
             self.time = min(max(next_time(self.time), 0.0), self.duration)
+            self._draw_now()
+
+    def follow(self, time: float, speed: float) -> None:
+        """Somebody else's clock: be where it is and go on at its speed; 0 stands still."""
+        with self._changed:
+            is_going_on = bool(speed) and self.is_playing and speed == self.speed
+            now = self.time + self.speed * (self._now() - self._drawn)
+            if is_going_on and abs(now - time) < APART:
+                return
+            self.time = min(max(time, 0.0), self.duration)
+            self.is_playing, self.speed = bool(speed), speed or self.speed
+            self._drawn = self._now()
             self._draw_now()
 
     def set_speed(self, speed: float) -> None:

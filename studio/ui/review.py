@@ -12,6 +12,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from typing import Protocol
 
 import numpy as np
 import viser
@@ -22,6 +23,7 @@ from studio.cursor import Cursor
 from studio.episode import Episode, open_episode
 from studio.index import EpisodeRow
 from studio.ui import scene
+from studio.ui.company import Company
 from studio.ui.playback import Playback
 from studio.ui.review_bar import COVERED, ReviewBar
 from studio.ui.scene import SceneModel, SceneView
@@ -39,11 +41,17 @@ class Review:
         client: viser.ClientHandle,
         row: EpisodeRow,
         model: Callable[[str], SceneModel],
-        gallery: viser.GuiFolderHandle,
+        gallery: viser.GuiFolderHandle | None,
         on_failure: Callable[[str], None],
+        others: Sequence[EpisodeRow] = (),
     ) -> None:
-        """`model` gives the scene of a task. The pictures go into `gallery`."""
-        self.row = row
+        """`model` gives the scene of a task. The pictures go into `gallery`.
+
+        Without one there are neither pictures nor a bar: the page of the dataset has both, and says what time
+        it is. The hands of the `others` are shown, too.
+        """
+        self.row, self.others = row, tuple(others)
+        self.shifts: Sequence[float] = [0.0] * len(others)  # [s] that each is ahead of this take's time
         self.playback = Playback(row.duration)
         self.shown = threading.Event()  # the first time is drawn
         self._server, self._client = server, client
@@ -69,7 +77,7 @@ class Review:
                 log.exception("The review of %s ended", self.row.episode_id)
                 self._on_failure(f"{self.row.episode_id} cannot be shown: {error}")
 
-    def _draw(self, parts: Sequence[_Scene | _Gallery | ReviewBar]) -> None:
+    def _draw(self, parts: Sequence[_Part]) -> None:
         while (at := self.playback.wait()) is not None:
             for part in parts:
                 part.show(at)
@@ -79,7 +87,7 @@ class Review:
     def _is_client_there(self) -> bool:
         return self._client.client_id in self._server.get_clients()
 
-    def _build(self, episode: Episode, undone: ExitStack) -> Sequence[_Scene | _Gallery | ReviewBar]:
+    def _build(self, episode: Episode, undone: ExitStack) -> Sequence[_Part]:
         cursor, model = None, None
         try:
             name = episode.header.task
@@ -89,17 +97,43 @@ class Review:
             why = str(error.args[0] if error.args else error)
             self._client.add_notification("No scene for this take", why, color="orange")
             cursor, model = Cursor(episode), None
-        parts: list[_Scene | _Gallery | ReviewBar] = []
+        parts: list[_Part] = []
         if model is not None:
             view = _Scene(self._client, model, cursor)
             undone.callback(view.remove)
-            undone.callback(_raise_view(self._client))
             parts.append(view)
+            parts += [self._other(number, model, undone) for number in range(len(self.others))]
+        if self._gallery is None:
+            return parts
+        if model is not None:
+            undone.callback(_raise_view(self._client))
         gallery = _Gallery(self._client, self._gallery, cursor)
         undone.callback(gallery.remove)
         bar = ReviewBar(self._client, _title(self.row), cursor, self.playback)
         undone.callback(bar.remove)
         return [*parts, gallery, bar]
+
+    def _other(self, number: int, model: SceneModel, undone: ExitStack) -> _Shifted:
+        episode = undone.enter_context(open_episode(self.others[number].path))
+        company = Company(self._client, model, Cursor(episode), number)
+        undone.callback(company.remove)
+        return _Shifted(self, company, number)
+
+
+class _Part(Protocol):
+    """What is drawn at each time."""
+
+    def show(self, at: float) -> None: ...
+
+
+class _Shifted:
+    """Another take, at its own time."""
+
+    def __init__(self, review: Review, company: Company, number: int) -> None:
+        self._review, self._company, self._number = review, company, number
+
+    def show(self, at: float) -> None:
+        self._company.show(at + self._review.shifts[self._number])
 
 
 class _Scene:

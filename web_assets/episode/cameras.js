@@ -7,7 +7,7 @@ const AT_ONCE = 6; // requests: browsers open no more connections to one server
 const AHEAD = 14; // images of each camera while playing
 const AROUND = 2; // images before and after the one that stands
 const KEPT = 160; // decoded images of each camera, 0.3 MB each
-const MOST = 6; // tiles; of more takes only the first cameras are shown
+const NARROWEST = 190; // [px] of a tile; of several takes only as many cameras are shown as find room
 
 // The images of one camera of one take.
 class Film {
@@ -61,11 +61,11 @@ class Film {
 
 export class Cameras {
   // `takes` as `view.js` makes them; their images' times may come later, see `setTimes`.
-  constructor(api, takes) {
+  constructor(api, takes, width) {
     this.api = api;
     this.queue = [];
     this.running = 0;
-    const most = Math.max(1, Math.floor(MOST / takes.length));
+    const most = takes.length > 1 ? Math.max(1, Math.floor(width / NARROWEST / takes.length)) : Infinity;
     this.films = takes.map((take) => take.row.cameras.slice(0, most).map((camera) => this.film(take, camera)));
     const label = (take) => takes.length > 1 && h("span", { class: "letter", style: { background: take.color } }, take.letter);
     this.element = h("div", { class: "cameras" }, takes.map((take, index) => this.films[index].map((film) => h(

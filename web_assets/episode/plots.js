@@ -4,7 +4,7 @@ import uPlot from "/assets/node_modules/uplot/dist/uPlot.esm.js";
 import { h } from "../dataset/dom.js";
 import { newest } from "./playhead.js";
 
-export const GUTTER = 76; // [px] left of every plot and lane
+export const GUTTER = 92; // [px] left of every plot and lane
 export const MARGIN = 14; // [px] right of them
 const HEIGHTS = [64, 92, 148]; // [px] of a plot
 const REMEMBERED = "studio.plots"; // in the browser's storage
@@ -37,12 +37,15 @@ function remembered() {
 export class Plots {
   // `onPointer(element)` makes what happens on a plot's area move the playhead or the axis.
   constructor(takes, axis, playhead, onPointer) {
-    Object.assign(this, { takes, axis, playhead, onPointer, spread: null, drawn: [] });
+    Object.assign(this, { takes, axis, playhead, onPointer, spread: null, drawn: [], onResize: () => {} });
     this.state = remembered();
     this.element = h("div", { class: "plots" });
     this.toggles = h("div", { class: "toggles", role: "group", "aria-label": "Plots" });
     this.arms = [...new Set(takes.flatMap((take) => take.timeline.arms.map((arm) => arm.name)))];
-    this.resizing = new ResizeObserver(() => this.resize());
+    this.resizing = new ResizeObserver(() => {
+      this.resize();
+      this.onResize();
+    });
     this.resizing.observe(this.element);
     this.build();
   }
@@ -60,7 +63,10 @@ export class Plots {
 
   // The takes have other curves, e.g. finer ones.
   refresh() {
-    for (const each of this.drawn) each.plot.setData(this.dataOf(each.series), true);
+    for (const each of this.drawn) {
+      each.read = each.series.map((one) => one.read());
+      each.plot.setData(this.dataOf(each.read), true);
+    }
     this.move();
   }
 
@@ -71,10 +77,11 @@ export class Plots {
 
   // What the curves are at the playhead.
   move() {
-    for (const { plot, values, quantity } of this.drawn) {
-      const at = newest(plot.data[0], this.playhead.time);
+    for (const { read, values, quantity } of this.drawn) {
       values.forEach((element, index) => {
-        const value = plot.data[index + 1]?.[at];
+        const [times, curve] = read[index];
+        const isWithin = this.playhead.time <= times.at(-1) + 0.1 && this.playhead.time >= times[0] - 0.1;
+        const value = isWithin ? curve[newest(times, this.playhead.time)] : null;
         const text = value === null || value === undefined ? "–" : value.toFixed(quantity.digits);
         if (element.firstChild.data !== text) element.firstChild.data = text;
       });
@@ -171,8 +178,7 @@ export class Plots {
     return { label, stroke: color, width: XYZ.includes(color) && this.takes.length === 1 ? 1 : 1.4, read, of: `${name} ${label}` };
   }
 
-  dataOf(series) {
-    const read = series.map((each) => each.read());
+  dataOf(read) {
     if (read.every(([time]) => time === read[0][0])) return [read[0][0], ...read.map(([, values]) => values)];
     return uPlot.join(read.map(([time, values]) => [time, values]));
   }
@@ -183,6 +189,7 @@ export class Plots {
       points: { show: false }, show: !this.state.series.includes(each.of),
     }));
     const bands = series[0]?.isEdge ? [{ series: [1, 2], fill: "rgba(170, 178, 189, 0.22)" }] : [];
+    const read = series.map((each) => each.read());
     const host = h("div", { class: "plot", "data-plot": title });
     const plot = new uPlot({
       width: this.element.clientWidth || 640,
@@ -198,7 +205,7 @@ export class Plots {
       series: [{}, ...lines],
       bands,
       hooks: { drawClear: [(u) => this.shade(u, arm)] },
-    }, this.dataOf(series), host);
+    }, this.dataOf(read), host);
     this.onPointer(plot.over);
     const values = series.map(() => h("b", {}, "–"));
     const key = h("div", { class: "key" }, h("span", {}, `${title} [${quantity.unit}]`), series.map((each, index) => (each.isEdge || (!each.label && series.length === 1)
@@ -208,7 +215,7 @@ export class Plots {
         title: "Show or hide", onclick: () => this.toggle("series", each.of),
       }, each.label, " ", values[index]))));
     host.prepend(key);
-    this.drawn.push({ plot, series, values, quantity });
+    this.drawn.push({ plot, series, read, values, quantity });
     return host;
   }
 

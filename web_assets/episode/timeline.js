@@ -148,7 +148,8 @@ export class Timeline {
         event.stopPropagation();
         this.seek(this.at(mark));
       };
-      const element = h("button", { class: `mark ${mark.kind}`, title, "aria-label": title, onclick: jump, onpointerdown: (event) => event.stopPropagation() });
+      const kind = mark.kind === "mode" ? `mode ${mark.text.split(" to ").at(-1).split(" ")[0]}` : mark.kind;
+      const element = h("button", { class: `mark ${kind}`, title, "aria-label": title, onclick: jump, onpointerdown: (event) => event.stopPropagation() });
       return { element, start: this.at(mark), end: mark.end - mark.take.anchor, least: 5 };
     });
     return parts.length ? this.strip("events", "band marks", parts) : null;

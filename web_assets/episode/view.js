@@ -108,7 +108,7 @@ export class EpisodeView {
     this.alignment = "start";
     this.axis = new Axis(...reach(this.takes));
     this.playhead = new Playhead(this.axis);
-    this.cameras = new Cameras(this.api, this.takes);
+    this.cameras = new Cameras(this.api, this.takes, this.section.clientWidth);
     this.build();
     const read = await attempt(() => Promise.all(this.takes.map((take) => this.read(take))));
     if (opening !== this.opening) return;
@@ -142,7 +142,7 @@ export class EpisodeView {
     const author = this.author();
     const row = await attempt(() => this.api.post(`${path(take)}/annotations`, { ...(author && { author }), ...changes }));
     if (row) this.changed(row);
-    if (this.takes[0] === take) await this.readSaid();
+    if (this.takes[0] === take && take.row !== row) await this.readSaid();
   }
 
   // Timeline and plots anew, on an axis of their own.
@@ -159,6 +159,7 @@ export class EpisodeView {
     this.body.replaceChildren(h("div", { class: "stack" }, this.timeline.element, this.plots.element, this.timeline.over));
     this.axis.listeners.push(() => this.zoomed());
     this.playhead.listeners.push(() => this.moved());
+    this.plots.onResize = () => this.timeline.draw();
     this.plots.resize();
     this.timeline.draw();
     if (this.takes.length > 1) this.playhead.move(0);
@@ -218,9 +219,9 @@ export class EpisodeView {
   // The parts that stay while a take is in view
 
   build() {
-    this.head = h("div", { class: "head" });
-    this.bar = h("div", { class: "bar" }, this.transport(), h("div", { class: "toggles" }));
-    this.body = h("div", { class: "body" }, h("p", { class: "empty" }, "Reading…"));
+    this.head = h("div", { class: "take-head" });
+    this.bar = h("div", { class: "controls" }, this.transport(), h("div", { class: "toggles" }));
+    this.body = h("div", { class: "take-body" }, h("p", { class: "empty" }, "Reading…"));
     this.section.replaceChildren(h("div", { class: "view" }, this.head, this.cameras.element, this.bar, this.body));
     this.showHead();
   }
@@ -250,7 +251,7 @@ export class EpisodeView {
     const isSingle = this.takes.length === 1;
     this.head.replaceChildren(isSingle ? this.about(this.takes[0].row) : this.legend(), h("div", { class: "actions" },
       isSingle ? this.links(this.takes[0].row) : this.choices(),
-      this.onClose && h("button", { class: "close", "aria-label": "Close the take", title: "Close (Esc)", onclick: this.onClose }, "×")));
+      this.onClose && h("button", { class: "leave", "aria-label": "Close the take", title: "Close (Esc)", onclick: this.onClose }, "×")));
   }
 
   about(row) {
