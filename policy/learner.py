@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import platform
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -141,19 +142,24 @@ class Learner:
         if not len(self._aside):
             return {}
         self.averaged.eval()
-        losses, errors = [], []
+        sums: dict[str, float] = defaultdict(float)  # of the loss, and of its groups
+        errors = []
         for indices in np.array_split(self._aside, math.ceil(len(self._aside) / self.config.batch)):
             batch = self.batches.of(indices).to(self.machine.device)
             with torch.no_grad(), self.machine.autocast():
                 values = self.averaged(batch)
-                losses.append(self.averaged.errors(values, batch)["loss"].item() * len(indices))
+                told = self.averaged.errors(values, batch)
+            for name, value in told.items():
+                sums[name] += value.item() * len(indices)
             errors.append(self._errors(values.double().cpu().numpy(), indices))
         self.model.train()
-        self._validation = sum(losses) / len(self._aside)
+        losses = {name: total / len(self._aside) for name, total in sums.items()}
+        self._validation = losses.pop("loss")
         self.is_best = self.best is None or self._validation < self.best
         self.best = self._validation if self.is_best else self.best
         means = {name: float(np.mean([e[name] for e in errors])) for name in errors[0]}
-        return {"validation": self._validation, **means}
+        groups = {f"validation_{name}": value for name, value in losses.items()}
+        return {"validation": self._validation, **groups, **means}
 
     def _errors(self, values: Array, indices: Array) -> dict[str, float]:
         """Mean errors of predictions (n, chunk, width) over the steps that lie in the takes."""
@@ -202,7 +208,12 @@ class Learner:
             board.close()
 
     def save(self) -> Path:
-        """A checkpoint of this step; the last, and the best where the last validation was."""
+        """A checkpoint of this step; the last, and the best where the last validation was.
+
+        Raises FileNotFoundError where somebody removed the run meanwhile.
+        """
+        if not (self.run / checkpoint.CONFIG).exists():
+            raise FileNotFoundError(f"Somebody removed {self.run / checkpoint.CONFIG} while the run learned.")
         config, encoding = self.config, self.features.encoding
         spec = PolicySpec(
             run=self.run.name,

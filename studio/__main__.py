@@ -5,15 +5,12 @@ Exit status: 0 done, 1 a check or a task failed, 2 wrong use. With `--json` the 
 
 from __future__ import annotations
 
-import functools
-import itertools
 import sys
 from collections.abc import Callable, Sequence
 
 import tyro
 
-from policy.config import PRESETS
-from studio.commands import dataset, exchange, machine, policies, recording, serving, takes
+from studio.commands import dataset, exchange, jobs, machine, policies, recording, serving, takes
 from studio.commands.terminal import complain
 
 COMMANDS: dict[str, Callable[..., int]] = {
@@ -40,8 +37,22 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "import": exchange.import_takes,
     "collections": dataset.show_collections,
     "collection": dataset.collection,
+    "jobs": jobs.list_jobs,
     "steamvr": serving.steamvr,
     "bench": machine.bench,
+}
+
+
+JOBS: dict[str, Callable[..., int]] = {
+    "list": jobs.list_jobs,
+    "show": jobs.show,
+    "log": jobs.log,
+    "submit": jobs.submit,
+    "cancel": jobs.cancel,
+    "resume": jobs.resume,
+    "delete": jobs.delete,
+    "restore": jobs.restore,
+    "slots": jobs.slots,
 }
 
 
@@ -49,8 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit."""
     status: int = 2
     try:
-        commands = COMMANDS | {"train": _train_with(sys.argv[1:] if arguments is None else arguments)}
-        status = tyro.extras.subcommand_cli_from_dict(commands, prog="studio", args=arguments)
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        commands, program = COMMANDS | {"train": policies.train_with(given)}, "studio"
+        verb = given[1] if given[:1] == ["jobs"] and len(given) > 1 else "--"
+        if not verb.startswith("--") or verb == "--help":
+            commands, program, given = JOBS, "studio jobs", given[1:]
+        status = tyro.extras.subcommand_cli_from_dict(commands, prog=program, args=given)
     except KeyboardInterrupt:
         complain("Interrupted.")
         status = 130
@@ -60,14 +75,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         complain(str(error))
         status = 1
     sys.exit(status)
-
-
-def _train_with(arguments: Sequence[str]) -> Callable[..., int]:
-    """`train` with the settings of the preset that is asked for as its defaults, which `--help` shows."""
-    asked = [value for name, value in itertools.pairwise(arguments) if name == "--preset"]
-    asked += [name.partition("=")[2] for name in arguments if name.startswith("--preset=")]
-    chosen = next((config for preset, config in PRESETS.items() if preset in asked), PRESETS["small"])
-    return functools.partial(policies.train, config=chosen)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from studio.export import imports
 from studio.health import TakeHealth
 from studio.index import EpisodeRow, Filters
 from studio.inputs.scripted import ScriptedAgent
+from studio.jobs import plans
 from studio.jobs.plans import Request
 from studio.jobs.queue import JobNow, Jobs
 from studio.pilot import runs_of
@@ -200,7 +201,7 @@ class Studio:
 
     def submit(self, request: Request) -> JobNow:
         """Put a job into the queue; `studio.jobs.plans` makes requests, `jobs` tells what becomes of them."""
-        return self.jobs.submit(request.job, request.files)
+        return plans.submit(self.jobs, request)
 
     # Takes
 

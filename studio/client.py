@@ -27,12 +27,14 @@ import numpy as np
 
 from controller.types import Array
 from studio.channels import Latest
+from studio.client_jobs import JobsClient
 from studio.collections import Collection
 from studio.curves import Curves, Spread, Timeline
 from studio.http_wire import CollectionDetails, Details, Graded, Health, Page, TaskInfo
 from studio.index import Amount, EpisodeRow, Filters
 from studio.lease import Standing
 from studio.messages import ArmFrame, Command, Notice, Status, builtins
+from studio.runs import RunInfo
 
 API = "/api/v1"
 TIMEOUT = 60.0  # [s] for the health of a long take, or its columns
@@ -91,9 +93,14 @@ class Client:
     def tasks(self) -> list[TaskInfo]:
         return self._get("/tasks", list[TaskInfo])
 
-    def runs(self) -> dict[str, list[str]]:
-        """Names of the runs that have learned each task, the newest first."""
-        return self._get("/runs", dict[str, list[str]])
+    @property
+    def jobs(self) -> JobsClient:
+        """What runs in the background, and what came of it."""
+        return JobsClient(self)
+
+    def runs(self, task: str = "") -> list[RunInfo]:
+        """All, or those that learn a task; the one that learned last comes first."""
+        return self._get("/runs", list[RunInfo], task=task)
 
     def evaluations(self) -> list[dict[str, Any]]:
         return self._get("/evaluations", list[dict[str, Any]])
@@ -280,7 +287,7 @@ class Client:
     def _signed(self, changes: dict[str, Any]) -> dict[str, Any]:
         return {"author": self.author} | changes
 
-    def _get(self, path: str, kind: type[T], **params: Any) -> T:
+    def _get(self, path: str, kind: type[T], /, **params: Any) -> T:
         given = {name: value for name, value in params.items() if value is not None}
         return _decoded(self._ask("GET", path, params=given), kind)
 

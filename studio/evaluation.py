@@ -5,6 +5,7 @@ DATA/evaluations/<id>.json      an `Evaluation`; its rollouts are episodes of th
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +141,22 @@ def load(path: Path) -> Evaluation:
 
 
 def load_all(data_dir: Path) -> list[Evaluation]:
-    """Those of a data folder, the newest first."""
-    paths = _path(data_dir, "").parent.glob("*.json")
-    return sorted((load(path) for path in paths), key=lambda evaluation: -evaluation.started)
+    """Those of a data folder, the newest first; damaged files are named in the log."""
+    found = []
+    for path in _path(data_dir, "").parent.glob("*.json"):
+        try:
+            found.append(load(path))
+        except ValueError as error:
+            log.warning("%s", error)
+    return sorted(found, key=lambda evaluation: -evaluation.started)
+
+
+def named(data_dir: Path, evaluation_id: str) -> Evaluation:
+    """By its id alone. Raises KeyError for an unknown one, ValueError for a damaged file."""
+    path = _path(data_dir, evaluation_id)
+    if path.parent != data_dir / "evaluations" or evaluation_id.startswith(".") or not path.is_file():
+        raise KeyError(f"No evaluation {evaluation_id!r}.")
+    return load(path)
 
 
 def find(data_dir: Path, name: str, task: str | None = None) -> Evaluation:
@@ -184,12 +200,14 @@ class Comparison:
     only_one: int  # scenes in which only `one` succeeded
     only_other: int
     difference: float  # of the success rates
+    difference_95: tuple[float, float]  # see `paired_interval`
     mcnemar_p: float  # exact, two-sided
     force_difference_N: float  # mean over pairs of the mean contact force, `one` less `other`
 
     def __str__(self) -> str:
         return (
-            f"{self.one} against {self.other} on {self.pairs} scenes of {self.task}: {self.difference:+.0%} "
+            f"{self.one} against {self.other} on {self.pairs} scenes of {self.task}: {self.difference:+.0%}, "
+            f"95 % {self.difference_95[0]:+.0%} to {self.difference_95[1]:+.0%} "
             f"({self.only_one} : {self.only_other} where only one succeeded, exact McNemar p = "
             f"{self.mcnemar_p:.2g}), contact force {self.force_difference_N:+.1f} N."
         )
@@ -216,6 +234,7 @@ def compare(one: Evaluation, other: Evaluation) -> Comparison:
         only_one=only_one,
         only_other=only_other,
         difference=(only_one - only_other) / len(pairs),
+        difference_95=paired_interval(only_one, only_other, len(pairs)),
         mcnemar_p=mcnemar(only_one, only_other),
         force_difference_N=_mean(a.force_mean_N - b.force_mean_N for a, b in pairs),
     )
@@ -233,9 +252,23 @@ def pooled(comparisons: Sequence[Comparison], one: str, other: str) -> Compariso
         only_one=only_one,
         only_other=only_other,
         difference=(only_one - only_other) / pairs,
+        difference_95=paired_interval(only_one, only_other, pairs),
         mcnemar_p=mcnemar(only_one, only_other),
         force_difference_N=sum(c.force_difference_N * c.pairs for c in comparisons) / pairs,
     )
+
+
+def paired_interval(only_one: int, only_other: int, pairs: int) -> tuple[float, float]:
+    """95 % interval of the difference of two success rates on the same scenes; (-1, 1) without any.
+
+    Wald's, with half a scene added to each of the four outcomes (Agresti and Min, Statist. Med. 2005).
+    """
+    if pairs == 0:
+        return -1.0, 1.0
+    n, one, other = pairs + 2.0, only_one + 0.5, only_other + 0.5
+    difference = (one - other) / n
+    half = 1.959963984540054 * math.sqrt((one + other) - (one - other) ** 2 / n) / n
+    return max(-1.0, difference - half), min(1.0, difference + half)
 
 
 def mcnemar(only_one: int, only_other: int) -> float:

@@ -26,6 +26,7 @@ from studio.api import Studio
 from studio.channels import Latest
 from studio.door import person_of
 from studio.http_jobs import jobs_router
+from studio.http_runs import runs_router
 from studio.http_takes import takes_router
 from studio.http_view import Views, view_router
 from studio.http_wire import Body, Name, Problem, TaskInfo, as_json, refusals, schema_of
@@ -102,9 +103,7 @@ class ControlIn(Body):
     action: Literal["ask", "give up", "keep"]  # ask: take it where it is free, else ask its holder
 
 
-def add_api(
-    app: FastAPI, studio: Studio, remote: Remote, lease: Lease, views: Views | None = None
-) -> Reader:
+def add_api(app: FastAPI, studio: Studio, remote: Remote, lease: Lease, views: Views | None = None) -> Reader:
     """Mount the routes and our pages; close the reader that is returned when the server has ended.
 
     `views` are those of the page, where there is one.
@@ -115,6 +114,7 @@ def add_api(
     app.include_router(view_router(studio, reader, views), prefix="/api/v1")
     app.include_router(_studio_router(studio), prefix="/api/v1")
     app.include_router(jobs_router(studio), prefix="/api/v1")
+    app.include_router(runs_router(studio, reader), prefix="/api/v1")
     add_pages(app)
 
     @app.get("/api/docs", include_in_schema=False)
@@ -137,16 +137,6 @@ def _studio_router(studio: Studio) -> APIRouter:
     def list_tasks() -> Response:
         """The tasks that can be chosen."""
         return as_json([_task_info(name) for name in tasks.names()])
-
-    @router.get("/runs", response_model=dict[str, list[str]])
-    def list_runs() -> Response:
-        """Names of the runs that have learned each task, the newest first."""
-        return as_json({task: studio.runs_of(task) for task in tasks.names()})
-
-    @router.get("/evaluations", response_model=list[dict[str, Any]])
-    def list_evaluations() -> Response:
-        """What came of each evaluation, the newest first."""
-        return as_json([found.summary() for found in studio.evaluations()])
 
     return router
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Annotated, Any, Literal
@@ -159,6 +162,34 @@ class DemoIn(Asked):
         )
 
 
+class SweepIn(Body):
+    """A job for each combination of the values of some fields: settings of training, or fields of the job."""
+
+    job: TrainIn | EvaluateIn = Field(discriminator="kind")
+    fields: dict[Name, Annotated[list[Any], Field(min_length=1, max_length=64)]]
+    name: Name = ""
+
+    def requests(self, studio: Studio) -> list[Request]:
+        def make(swept: Mapping[str, Any], where: Where) -> Request:
+            told = self.job.model_dump()
+            known = {name: value for name, value in swept.items() if name in type(self.job).model_fields}
+            others = {name: value for name, value in swept.items() if name not in known}
+            if isinstance(self.job, TrainIn):
+                count = next(numbers)
+                name = f"{self.job.name or where.sweep}-{count}"
+                body = TrainIn.model_validate(
+                    {**told, "name": name, **known, "config": {**self.job.config, **others}}
+                )
+                return body.request(studio, where)
+            if others:
+                raise ValueError(f"An evaluation has no {', '.join(others)}.")
+            return EvaluateIn.model_validate({**told, **known}).request(studio, where)
+
+        numbers = itertools.count(1)
+        where = dataclasses.replace(self.job.where(), sweep=self.name)
+        return plans.sweep(make, where, self.fields)
+
+
 JobIn = Annotated[TrainIn | EvaluateIn | ExportIn | DemoIn, Field(discriminator="kind")]
 
 
@@ -191,6 +222,7 @@ def jobs_router(studio: Studio) -> APIRouter:
         found = [now for now in jobs.all() if kind in (None, now.job.kind) and sweep in ("", now.job.sweep)]
         answer = as_json(found)
         answer.headers["ETag"] = tag = f'"{sha256(answer.body).hexdigest()[:24]}"'
+        answer.headers["Cache-Control"] = "no-cache"  # ask each time, with the tag
         return Response(status_code=304, headers={"ETag": tag}) if if_none_match == tag else answer
 
     @router.post("/jobs", response_model=JobNow, status_code=201)
@@ -198,6 +230,12 @@ def jobs_router(studio: Studio) -> APIRouter:
         """Put a job at the end of the queue; it may start at once. What cannot work is refused here."""
         with refusals():
             return as_json(studio.submit(body.request(studio, body.where())), 201)
+
+    @router.post("/sweeps", response_model=list[JobNow], status_code=201)
+    def submit_sweep(body: SweepIn) -> Response:
+        """A job for each combination of some values; all of them are checked before the first is queued."""
+        with refusals():
+            return as_json([studio.submit(request) for request in body.requests(studio)], 201)
 
     @router.get("/jobs/{job_id}", response_model=JobNow)
     def read_job(job_id: JobId) -> Response:

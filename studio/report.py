@@ -8,17 +8,21 @@ OUT/drawings.png            the mean drawing of each agent, with its likeness to
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from controller.types import Array
-from studio.episode import Episode
-from studio.evaluation import Comparison, Evaluation, Rollout, compare, pooled, wilson
+from studio.catalog import Catalog
+from studio.episode import Episode, open_episode
+from studio.evaluation import Comparison, Evaluation, Rollout, compare, named, pooled, wilson
 from studio.tasks import drawing
 
 # Okabe and Ito's colours, told apart by everybody.
@@ -45,6 +49,21 @@ def write(evaluations: Sequence[Evaluation], open_episode: OpenEpisode, out: Pat
         figure.savefig(out / name, dpi=DPI)
     (out / "report.md").write_text(_text(evaluations))
     return [out / "report.md", *(out / name for name in figures)]
+
+
+def picture(data_dir: Path, evaluation_ids: Sequence[str], figure: Literal["force", "stiffness"]) -> bytes:
+    """A figure of evaluations of one task by their ids, as PNG. Raises KeyError for unknown ones."""
+    found = [named(data_dir, evaluation_id) for evaluation_id in evaluation_ids]
+    if not found or len({evaluation.task for evaluation in found}) > 1:
+        raise ValueError("A figure shows evaluations of one task.")
+    if figure == "force":
+        drawn = force_figure(found)
+    else:
+        with closing(Catalog(data_dir)) as catalog:
+            drawn = stiffness_figure(found, lambda name: open_episode(catalog.get(name).path))
+    file = io.BytesIO()
+    drawn.savefig(file, dpi=DPI, format="png")
+    return file.getvalue()
 
 
 # Tables

@@ -73,6 +73,7 @@ def open_site(
     is_local = is_loopback(host)
     with contextlib.ExitStack() as stack:
         studio = stack.enter_context(Studio(data_dir))
+        stack.enter_context(studio.jobs.kept_going())
         for recovery in studio.recover():
             tell(recovery.what)
         if not is_local and certificate is None and tls:

@@ -191,14 +191,29 @@ def train(
         return learn(run.config, dataset, run.folder, resume=run.is_begun, tell=on_step)
 
 
+def is_held(lock: Path) -> bool:
+    """Whether a process that lives holds a lock file."""
+    try:
+        with lock.open("r") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        return True
+    return False
+
+
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Be the only one that lets a run learn; the lock dies with its process."""
     with (folder / LOCK).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RuntimeError(f"Another process lets {folder.name} learn already.") from None
+        for _ in range(20):  # who looks whether it is held (`is_held`) holds it for a moment
+            with suppress(BlockingIOError):
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            time.sleep(0.05)
+        else:
+            raise RuntimeError(f"Another process lets {folder.name} learn already.")
         yield
 
 

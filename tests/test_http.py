@@ -191,7 +191,7 @@ def test_health_is_told_for_one_and_for_all(site: Site, client: Client, ids: lis
 def test_tasks_runs_and_evaluations_are_listed(client: Client) -> None:
     assert {task.task for task in client.tasks()} > {"wiping", "peg-cylinder"}
     assert client.tasks()[0].arms
-    assert set(client.runs()) == {task.task for task in client.tasks()}
+    assert client.runs() == []
     assert client.evaluations() == []
 
 
@@ -377,6 +377,7 @@ def test_nothing_that_the_description_allows_breaks_the_server(tmp_path: Path, e
     """Half of the requests are about a take, a camera and a collection that exist."""
     record(tmp_path, 2)
     site = Site(tmp_path)
+    site.studio.jobs.slots = 0  # what is asked for waits
     rows = site.studio.episodes()
     real = {"episode_id": rows[0].episode_id, "camera": "front", "name": "known", "number": 3, "at": 0.2}
     site.studio.make_collection("known", episode_ids=[rows[1].episode_id])

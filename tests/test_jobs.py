@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 from test_training import QUICK
 from visitor import wait_for
 
+from studio import runs
 from studio.api import DemoReport, Studio
 from studio.jobs import plans
+from studio.jobs.job import STATE
 from studio.jobs.plans import Request, Where
-from studio.jobs.queue import JobBusyError, JobNow
+from studio.jobs.queue import JobBusyError, JobNow, Jobs
 
 ANN = Where(author="ann", threads=1)
 LONG = 60.0  # [s] for a command to load its libraries on a busy machine
@@ -91,3 +95,173 @@ def test_a_cancelled_export_leaves_nothing_behind(studio: Studio) -> None:
     assert not (studio.data_dir / "exports").exists()
     with pytest.raises(JobBusyError, match="cancelled already"):
         studio.jobs.cancel(now.job.job_id)
+
+
+def test_training_goes_on_after_everything_was_killed(studio: Studio) -> None:
+    now = studio.submit(training(studio, steps=3000, save_every=1, validate_every=3000))
+    folder = studio.data_dir / "runs" / "learner"
+    assert len(json.loads((folder / "takes.json").read_text())) == 2  # as they were when it was asked for
+    origin = json.loads((folder / "origin.json").read_text())
+    assert (origin["author"], origin["task"]) == ("ann", "wiping")
+    with pytest.raises(ValueError, match="There is a run learner already"):
+        training(studio)
+    at_work(studio, now.job.job_id, done=5)
+    with pytest.raises(ValueError, match="is learning"):
+        runs.delete(studio.data_dir, "learner")
+    told = studio.jobs.get(now.job.job_id).standing
+    for pid in (told.pid, told.command_pid):
+        os.kill(pid or 0, signal.SIGKILL)
+    # Whoever opens the folder next finds it, as no keeper could say how it ended.
+    wait_for(lambda: not psutil.pid_exists(told.command_pid or 0))
+    other = Jobs(studio.data_dir)
+    other.advance()
+    assert other.get(now.job.job_id).standing.state == "interrupted"
+    step = runs.load(studio.data_dir, "learner").step
+    assert step >= 4
+    studio.jobs.resume(now.job.job_id)
+    at_work(studio, now.job.job_id, done=step + 3)
+    studio.jobs.cancel(now.job.job_id)
+    ended = over(studio, now.job.job_id)
+    assert ended.standing.state == "cancelled"
+    assert ended.progress is not None
+    assert ended.progress.first >= step
+    saved = runs.load(studio.data_dir, "learner")
+    assert saved.step == ended.progress.done  # SIGTERM lets it save where it is
+    assert not saved.is_learning
+
+
+def test_a_killed_keeper_takes_its_command_along(studio: Studio) -> None:
+    now = at_work(studio, studio.submit(demo(studio)).job.job_id)
+    waiting = studio.submit(export(studio))
+    os.kill(now.standing.pid or 0, signal.SIGKILL)
+    wait_for(lambda: not psutil.pid_exists(now.standing.command_pid or 0))
+    studio.jobs.advance()
+    assert studio.jobs.get(now.job.job_id).standing.state == "interrupted"
+    assert studio.jobs.get(waiting.job.job_id).standing.state == "running"
+
+
+def test_a_killed_command_is_told_with_its_last_lines(studio: Studio) -> None:
+    now = at_work(studio, studio.submit(demo(studio)).job.job_id)
+    os.kill(now.standing.command_pid or 0, signal.SIGKILL)
+    told = over(studio, now.job.job_id)
+    assert told.standing.state == "interrupted"
+    assert told.standing.why == "SIGKILL ended it; perhaps the memory was not enough."
+
+
+def test_a_command_that_does_not_end_is_killed(studio: Studio) -> None:
+    request = demo(studio)
+    hasty = dataclasses.replace(request, job=dataclasses.replace(request.job, grace=0.5))
+    now = at_work(studio, studio.submit(hasty).job.job_id)
+    os.kill(now.standing.command_pid or 0, signal.SIGSTOP)  # it hears no SIGTERM
+    studio.jobs.cancel(now.job.job_id)
+    assert over(studio, now.job.job_id).standing.state == "cancelled"
+
+
+def test_a_job_that_fails_says_why(studio: Studio) -> None:
+    request = export(studio)
+    studio.delete(studio.episodes()[0].episode_id)  # between asking and doing
+    now = over(studio, studio.submit(request).job.job_id)
+    assert (now.standing.state, now.standing.exit_code) == ("failed", 2)
+    assert "is in the trash" in now.standing.why
+    assert any("is in the trash" in line for line in now.last_lines)
+    assert not (studio.data_dir / "exports" / "out").exists()
+
+
+def test_what_cannot_work_is_refused_before_it_waits(studio: Studio) -> None:
+    with pytest.raises(ValueError, match="none has outcome success, min_quality 5"):
+        plans.train(studio.catalog, ANN, "wiping", QUICK, filters={"min_quality": 5})
+    with pytest.raises(ValueError, match="No demonstration of 'drawing'"):
+        plans.train(studio.catalog, ANN, "drawing", QUICK)
+    with pytest.raises(KeyError, match="No run 'nobody'"):
+        plans.evaluate(studio.catalog, ANN, "nobody")
+    with pytest.raises(ValueError, match="No take is chosen"):
+        plans.export(studio.catalog, ANN, "out", filters={"task": "drawing"})
+    with pytest.raises(ValueError, match="cannot name an export"):
+        plans.export(studio.catalog, ANN, "../out", filters={"task": "wiping"})
+    with pytest.raises(KeyError, match="No task"):
+        plans.demo(studio.catalog, ANN, "juggling")
+    studio.jobs.slots = 0
+    studio.submit(export(studio))
+    with pytest.raises(JobBusyError, match="is queued already"):
+        studio.submit(export(studio))
+    with pytest.raises(KeyError, match="No job 'x'"):
+        studio.jobs.get("x")
+    with pytest.raises(KeyError, match="No job"):
+        studio.jobs.get("../runs")
+
+
+def test_deleting_a_job_and_its_run_can_be_undone(studio: Studio) -> None:
+    studio.jobs.slots = 0
+    now = studio.submit(training(studio))
+    run = studio.data_dir / "runs" / "learner"
+    kept = sorted(path.name for path in run.iterdir())
+    studio.jobs.delete(now.job.job_id)
+    assert (studio.jobs.all(), studio.jobs.trash()) == ([], [now.job])
+    assert not run.exists()
+    studio.jobs.restore(now.job.job_id)
+    assert studio.jobs.all() == [now]
+    assert sorted(path.name for path in run.iterdir()) == kept
+    with pytest.raises(KeyError, match="in the trash"):
+        studio.jobs.restore(now.job.job_id)
+
+
+def test_folders_that_somebody_edited_are_told_apart(studio: Studio) -> None:
+    studio.jobs.slots = 0
+    kept = studio.submit(export(studio, "a"))
+    damaged, removed = (studio.submit(export(studio, name)).job.job_id for name in "bc")
+    (studio.jobs.folder(damaged) / STATE).write_text("{half")
+    shutil.rmtree(studio.jobs.folder(removed))
+    (studio.data_dir / "jobs" / "mine").mkdir()
+    (studio.data_dir / "jobs" / "mine" / "job.json").write_text("{}")
+    studio.jobs.advance()
+    states = {now.job.job_id: now.standing for now in studio.jobs.all()}
+    assert states.keys() == {kept.job.job_id, damaged}
+    assert states[damaged].state == "interrupted"
+    assert "missing or damaged" in states[damaged].why
+    studio.jobs.resume(damaged)
+    assert studio.jobs.get(damaged).standing.state == "queued"
+
+
+def test_a_job_whose_folder_is_removed_ends(studio: Studio) -> None:
+    now = at_work(studio, studio.submit(demo(studio)).job.job_id)
+    shutil.rmtree(studio.jobs.folder(now.job.job_id))
+    wait_for(lambda: not psutil.pid_exists(now.standing.command_pid or 0))
+    assert studio.jobs.all() == []
+
+
+def test_a_sweep_makes_a_run_for_each_combination(studio: Studio) -> None:
+    def make(swept: Mapping[str, Any], where: Where) -> Request:
+        name = "-".join(map(str, swept.values()))
+        return plans.train(studio.catalog, where, "wiping", dataclasses.replace(QUICK, **swept), name=name)
+
+    studio.jobs.slots = 0
+    found = [studio.submit(r).job for r in plans.sweep(make, ANN, {"lr": [1e-3, 1e-4], "seed": [0, 1, 2]})]
+    assert [job.swept for job in found][1] == {"lr": 1e-3, "seed": 1}
+    assert len({job.sweep for job in found}) == 1
+    assert len({job.subject for job in found}) == 6
+    config = runs.load(studio.data_dir, found[5].subject).config
+    assert (config["lr"], config["seed"]) == (1e-4, 2)
+    with pytest.raises(ValueError, match="1 to 64 jobs, not 0"):
+        plans.sweep(make, ANN, {"lr": []})
+
+
+def test_curves_follow_a_run_that_is_resumed_and_damaged(tmp_path: Path) -> None:
+    reader, path = runs.MetricsReader(), tmp_path / "metrics.jsonl"
+    assert reader.read(tmp_path).curves == {}
+
+    def told(steps: Iterable[int]) -> str:
+        return "".join(json.dumps({"step": n, "loss": 1 / n, "lr": 0.1}) + "\n" for n in steps)
+
+    path.write_text(told(range(1, 101)) + '{"step": 101, "lo')
+    assert reader.read(tmp_path).step == 100  # the torn line may still become whole
+    path.write_text(told(range(1, 101)) + '{"step": 101, "lo\n' + told([102]))
+    found = reader.read(tmp_path, points=10)
+    assert (found.step, found.damaged, len(found.curves["loss"].step)) == (102, 1, 10)
+    assert found.curves["loss"].value[0] == pytest.approx(sum(1 / n for n in range(1, 11)) / 10, rel=1e-5)
+    assert found.last == {"loss": pytest.approx(1 / 102), "lr": 0.1}
+    assert reader.read(tmp_path, since=100).curves["lr"].step == [102]
+    path.write_text(told(range(1, 51)))  # resumed from step 50
+    assert reader.read(tmp_path).step == 50
+    with path.open("a") as file:
+        file.write(told(range(51, 60)))
+    assert reader.read(tmp_path).curves["loss"].step[-1] == 59

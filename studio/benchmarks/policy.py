@@ -8,6 +8,7 @@ batch 8 on two idle cores, six of its seven decoder layers dead; LeRobot's ACT, 
 from __future__ import annotations
 
 import dataclasses
+import os
 import resource
 import tempfile
 import time
@@ -50,6 +51,38 @@ def measure() -> dict[str, float]:
         **{f"paper_{name}": value for name, value in _apart(paper, PAPER_STEPS).items()},
         **{f"shallow_{name}": value for name, value in _apart(shallow, PAPER_STEPS).items()},
     }
+
+
+def step_seconds(
+    config: TrainConfig, arms: tuple[str, ...], cameras: tuple[str, ...], threads: int, steps: int = 3
+) -> float:
+    """[s] of the clock for a training step of a task with these arms and cameras, here and now.
+
+    Learns for a few steps in a process that gives way to others, as a job does; takes seconds.
+    """
+    config = dataclasses.replace(config, threads=threads)
+    with ProcessPoolExecutor(1, get_context("spawn"), os.nice, (10,)) as pool:
+        return pool.submit(_step_seconds, config, arms, cameras, steps).result()
+
+
+def _step_seconds(config: TrainConfig, arms: tuple[str, ...], cameras: tuple[str, ...], steps: int) -> float:
+    from policy.train import train
+
+    changes: dict[str, Any] = {"validation": 0.0, "backbone_weights": "", "tensorboard": False}
+    config = dataclasses.replace(config, **changes)
+    with tempfile.TemporaryDirectory() as folder:
+        size = (config.max_height, config.max_width) if config.images else None
+        build(Path(folder) / "cache", [partial(_made_up, 0, arms, cameras)], max_size=size)
+        ends = [time.perf_counter()]
+
+        def note(metrics: Mapping[str, float]) -> None:
+            ends.append(time.perf_counter())
+            if metrics["step"] > steps:
+                raise _Enough
+
+        with suppress(_Enough):
+            train(config, Dataset(Path(folder) / "cache"), Path(folder) / "measured", tell=note)
+    return float(np.median(np.diff(ends)[1:]))  # the first one warms up
 
 
 def _apart(config: TrainConfig, steps: int) -> dict[str, float]:
@@ -122,19 +155,20 @@ def _weights(folder: Path) -> Path:
     return path
 
 
-def _made_up(seed: int) -> AbstractContextManager[Recording]:
-    return nullcontext(_MadeUp(seed))
+def _made_up(
+    seed: int, arms: tuple[str, ...] = ("right",), cameras: tuple[str, ...] = CAMERAS
+) -> AbstractContextManager[Recording]:
+    return nullcontext(_MadeUp(seed, arms, cameras))
 
 
 class _MadeUp:
-    """A take of one arm that wanders, seen by two cameras that show noise; implements `Recording`."""
+    """A take of arms that wander, seen by cameras that show noise; implements `Recording`."""
 
     task = "made-up"
-    arms: tuple[str, ...] = ("right",)
 
-    def __init__(self, seed: int) -> None:
-        self.name = f"take {seed}"
-        self.cameras: Mapping[str, Size] = dict.fromkeys(CAMERAS, SIZE)
+    def __init__(self, seed: int, arms: tuple[str, ...], cameras: tuple[str, ...]) -> None:
+        self.name, self.arms = f"take {seed}", arms
+        self.cameras: Mapping[str, Size] = dict.fromkeys(cameras, SIZE)
         self.span = (0.0, SECONDS)
         self._rng = np.random.default_rng(seed)
 

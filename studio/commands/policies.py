@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -94,6 +96,14 @@ def train(
         )
         console.print(f"{end}: step {result.step} of {run.config.steps}, {run.folder}", soft_wrap=True)
     return 0
+
+
+def train_with(arguments: Sequence[str]) -> Callable[..., int]:
+    """`train` with the settings of the preset that is asked for as its defaults, which `--help` shows."""
+    asked = [value for name, value in itertools.pairwise(arguments) if name == "--preset"]
+    asked += [name.partition("=")[2] for name in arguments if name.startswith("--preset=")]
+    chosen = next((config for preset, config in PRESETS.items() if preset in asked), PRESETS["small"])
+    return functools.partial(train, config=chosen)
 
 
 def _training_line(metrics: Mapping[str, float]) -> str:

@@ -132,7 +132,7 @@ class _Keeper:
         if code == 0 or self._stopping:
             return dataclasses.replace(end, state="interrupted", why="It was asked to stop.")
         why = next(reversed(last_lines(self._folder, 1)), "It said nothing.")
-        return dataclasses.replace(end, state="failed", why=why)
+        return dataclasses.replace(end, state="failed", why=why.removeprefix("studio: "))
 
     def _is_cancelled(self) -> bool:
         return (self._folder / CANCEL).exists()

@@ -6,11 +6,14 @@ DATA/exports/<name>/      where an export goes that was asked for as a job
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
 import os
 import re
+import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +25,11 @@ from studio.evaluate import Plan
 from studio.export import Format, Options, choose
 from studio.index import Filters
 from studio.jobs.job import Job, Kind, new_job_id
+from studio.jobs.queue import JobNow, Jobs
 from studio.references import REFERENCES
-from studio.training import TAKES, Chosen
+from studio.training import TAKES, Chosen, Run
+
+MOST_OF_A_SWEEP = 64  # jobs
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}", re.ASCII)
 
@@ -50,6 +56,25 @@ class Request:
 
     job: Job
     files: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
+    run: Run | None = None  # a new one, whose folder `submit` makes
+    origin: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def submit(jobs: Jobs, request: Request) -> JobNow:
+    """Put a job into the queue. Raises FileExistsError where its run is there already."""
+    if request.run is None:
+        return jobs.submit(request.job, request.files)
+    folder = request.run.folder
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise FileExistsError(f"There is a run {folder.name} already; give another name.") from None
+    try:
+        training.lay_out(request.run, request.origin)
+        return jobs.submit(request.job, request.files)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)  # made just now, by us
+        raise
 
 
 def train(
@@ -63,22 +88,23 @@ def train(
     filters: Filters | None = None,
     collection: str | None = None,
 ) -> Request:
-    """Learn a new run, whose folder is made now. Raises ValueError where no take matches."""
+    """Learn a new run, of the takes that match now. Raises ValueError where none does."""
     tasks.load(task)
     run = training.prepare(
         catalog, task, config, name=name, episodes=episodes, filters=filters, collection=collection
     )
     asked = {"task": task, "episodes": episodes, "collection": collection, **_given(filters)}
-    training.lay_out(run, {"author": where.author, **asked})
     return Request(
-        _job(
+        run=run,
+        origin={"author": where.author, "sweep": where.sweep, **asked},
+        job=_job(
             "train",
             where,
             title=f"Train {run.folder.name}",
             command=("train", "--resume", run.folder.name),
             subject=run.folder.name,
             settings={**asked, "takes": len(run.takes), "config": dataclasses.asdict(config)},
-        )
+        ),
     )
 
 
@@ -122,6 +148,21 @@ def evaluate(
             settings={"agent": agent, "which": which, "step": plan.spec.step if plan.spec else None, **asked},
         )
     )
+
+
+def sweep(
+    make: Callable[[Mapping[str, Any], Where], Request], where: Where, fields: Mapping[str, Sequence[Any]]
+) -> list[Request]:
+    """A request for each combination of the values of some fields, named together."""
+    count = math.prod(map(len, fields.values())) if fields else 0
+    if not 1 <= count <= MOST_OF_A_SWEEP:
+        raise ValueError(f"A sweep makes 1 to {MOST_OF_A_SWEEP} jobs, not {count}.")
+    name = where.sweep or time.strftime("sweep-%Y%m%d-%H%M%S")
+    found = []
+    for values in itertools.product(*fields.values()):
+        swept = dict(zip(fields, values, strict=True))
+        found.append(make(swept, dataclasses.replace(where, sweep=name, swept=swept)))
+    return found
 
 
 def known_agent(data_dir: Path, name: str) -> str:
@@ -211,9 +252,13 @@ def demo(
     )
 
 
-def _job(kind: Kind, where: Where, **fields: Any) -> Job:
+def default_threads(processes: int) -> int:
+    """Of each process: all together leave one core to the live session."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    threads = where.threads or max(1, (cores - 1) // where.processes)
+    return max(1, (cores - 1) // processes)
+
+
+def _job(kind: Kind, where: Where, **fields: Any) -> Job:
     return Job(
         job_id=new_job_id(kind),
         kind=kind,
@@ -221,7 +266,7 @@ def _job(kind: Kind, where: Where, **fields: Any) -> Job:
         created=time.time(),
         runner=where.runner,
         processes=where.processes,
-        threads=threads,
+        threads=where.threads or default_threads(where.processes),
         sweep=where.sweep,
         swept=dict(where.swept),
         **fields,
@@ -260,8 +305,3 @@ def _flags(values: Mapping[str, Any]) -> list[str]:
         elif value is not None:
             flags += [f"--{dashed}", str(value)]
     return flags
-
-
-def run_folder(data_dir: Path, job: Job) -> Path | None:
-    """Of the run that a job learns."""
-    return data_dir / "runs" / job.subject if job.kind == "train" else None

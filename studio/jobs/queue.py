@@ -16,6 +16,7 @@ import fcntl
 import logging
 import os
 import shutil
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -40,6 +41,8 @@ from studio.jobs.job import (
 )
 from studio.jobs.local import LocalRunner
 from studio.jobs.runner import JobRunner
+
+PERIOD = 1.0  # [s] between two looks at the queue
 
 log = logging.getLogger(__name__)
 
@@ -222,6 +225,26 @@ class Jobs:
                     continue  # the cluster has it
                 if now.job.runner != "local" or self._n_running() < self.slots:
                     self._start(now)
+
+    @contextmanager
+    def kept_going(self) -> Iterator[None]:
+        """In it the queue goes on also where a keeper was killed, or a cluster takes its time."""
+        ended = threading.Event()
+
+        def go_on() -> None:
+            while not ended.wait(PERIOD):
+                try:
+                    self.advance()
+                except OSError as error:  # e.g. a full disk: the next time, perhaps
+                    log.warning("The queue of jobs waits: %s", error)
+
+        thread = threading.Thread(target=go_on, name="jobs", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
     def _start(self, now: JobNow) -> None:
         folder = self.folder(now.job.job_id)
