@@ -156,7 +156,8 @@ class ClientEpisodes:
             if list(episode_ids) != self._followed and (episode_ids or self._followed):
                 self._follow_others([self._catalog.get(each) for each in episode_ids])
             if self.review is not None and self._followed:
-                self.review.shifts = [*shifts, *[0.0] * len(episode_ids)][: len(episode_ids)]
+                n = len(self.review.others)
+                self.review.shifts = [*shifts, *[0.0] * n][:n]
                 self.review.playback.follow(time, speed)
 
     def _follow_others(self, rows: Sequence[EpisodeRow]) -> None:

@@ -66,9 +66,12 @@ class Review:
 
     def _run(self) -> None:
         try:
-            with open_episode(self.row.path) as episode, ExitStack() as undone:
+            with ExitStack() as opened, ExitStack() as undone:
+                first, *others = (
+                    opened.enter_context(open_episode(row.path)) for row in (self.row, *self.others)
+                )
                 try:
-                    self._draw(self._build(episode, undone))
+                    self._draw(self._build(first, others, undone))
                 finally:
                     if not self._is_client_there():  # its page has gone with all that was on it
                         undone.pop_all()
@@ -87,7 +90,7 @@ class Review:
     def _is_client_there(self) -> bool:
         return self._client.client_id in self._server.get_clients()
 
-    def _build(self, episode: Episode, undone: ExitStack) -> Sequence[_Part]:
+    def _build(self, episode: Episode, others: Sequence[Episode], undone: ExitStack) -> Sequence[_Part]:
         cursor, model = None, None
         try:
             name = episode.header.task
@@ -102,7 +105,10 @@ class Review:
             view = _Scene(self._client, model, cursor)
             undone.callback(view.remove)
             parts.append(view)
-            parts += [self._other(number, model, undone) for number in range(len(self.others))]
+            for number, other in enumerate(others):
+                company = Company(self._client, model, Cursor(other), number)
+                undone.callback(company.remove)
+                parts.append(_Shifted(self, company, number))
         if self._gallery is None:
             return parts
         if model is not None:
@@ -112,12 +118,6 @@ class Review:
         bar = ReviewBar(self._client, _title(self.row), cursor, self.playback)
         undone.callback(bar.remove)
         return [*parts, gallery, bar]
-
-    def _other(self, number: int, model: SceneModel, undone: ExitStack) -> _Shifted:
-        episode = undone.enter_context(open_episode(self.others[number].path))
-        company = Company(self._client, model, Cursor(episode), number)
-        undone.callback(company.remove)
-        return _Shifted(self, company, number)
 
 
 class _Part(Protocol):

@@ -10,7 +10,7 @@ const LABELS = ["approach", "contact", "wipe", "insert", "retract"];
 
 export class Segments {
   constructor(timeline, edit) {
-    Object.assign(this, { timeline, edit, all: [], chosen: null, last: LABELS[0], editing: null });
+    Object.assign(this, { timeline, edit, all: [], chosen: null, last: LABELS[0], editing: null, isHeld: false });
     this.lane = timeline.lane("segments", "segments");
     this.rail = this.lane.rail;
     this.rail.title = "Drag to mark a segment; double-click one to rename it, Delete removes it.";
@@ -22,7 +22,7 @@ export class Segments {
   }
 
   set(segments) {
-    if (this.editing) return; // what is being typed stays
+    if (this.editing || this.isHeld) return; // what is being typed or moved stays; its own edit comes next
     this.all = segments.map((segment) => ({ ...segment }));
     if (!this.all.some(({ segment_id: id }) => id === this.chosen)) this.chosen = null;
     this.build();
@@ -83,12 +83,14 @@ export class Segments {
     const segment = { start: from, end: from, label: "", segment_id: newId() };
     const box = this.box(segment);
     this.rail.append(box);
+    this.isHeld = true;
     drag(event, {
       move: (each) => {
         [segment.start, segment.end] = [from, this.at(each)].sort((one, other) => one - other);
         this.draw();
       },
       end: (each, hasMoved) => {
+        this.isHeld = false;
         if (!each || !hasMoved || segment.end - segment.start < SHORTEST) {
           box.remove();
           if (each && !hasMoved) this.timeline.seek(from);
@@ -125,6 +127,7 @@ export class Segments {
     const from = timeUnder(event, this.rail, this.timeline.axis);
     const length = before.end - before.start;
     this.choose(segment.segment_id);
+    this.isHeld = true;
     drag(event, {
       move: (each) => {
         if (what === "both") {
@@ -136,6 +139,7 @@ export class Segments {
         this.draw();
       },
       end: (each, hasMoved) => {
+        this.isHeld = false;
         if (each && hasMoved) this.put(segment);
         else Object.assign(segment, before);
         this.draw();

@@ -13,7 +13,7 @@ const KIND = { mode: "stiffness", limited: "limited", refused: "refused", event:
 export class Timeline {
   // `edit(changes)` sends an edit of the one take in view, whose `said` holds its trim and segments.
   constructor(takes, axis, playhead, edit) {
-    Object.assign(this, { takes, axis, playhead, edit, spans: [] });
+    Object.assign(this, { takes, axis, playhead, edit, spans: [], isHeld: false });
     this.isSingle = takes.length === 1;
     this.ticks = h("div", { class: "ticks" });
     this.ruler = this.lane("time [s]", "ruler", this.ticks);
@@ -31,7 +31,7 @@ export class Timeline {
 
   // What people say about the take: its trim, or null, and its segments.
   setSaid(trim, segments) {
-    this.trim = trim;
+    if (!this.isHeld) this.trim = trim;
     this.segments?.set(segments);
     this.draw();
   }
@@ -174,6 +174,7 @@ export class Timeline {
         if (event.button !== 0) return;
         const before = this.trim;
         const { duration } = this.takes[0].timeline;
+        this.isHeld = true;
         drag(event, {
           move: (each) => {
             const at = clamp(timeUnder(each, this.ruler.rail, this.axis), 0, duration);
@@ -182,6 +183,7 @@ export class Timeline {
             this.drawTrim();
           },
           end: (each, hasMoved) => {
+            this.isHeld = false;
             if (each && hasMoved) this.setTrim(side, this.trim[side === "in" ? 0 : 1]);
             else {
               this.trim = before;
