@@ -115,7 +115,7 @@ def add_api(app: FastAPI, studio: Studio, remote: Remote, lease: Lease, views: V
     app.include_router(_studio_router(studio), prefix="/api/v1")
     app.include_router(jobs_router(studio), prefix="/api/v1")
     app.include_router(runs_router(studio, reader), prefix="/api/v1")
-    add_pages(app)
+    add_pages(app, reader.start)
 
     @app.get("/api/docs", include_in_schema=False)
     async def show_docs() -> HTMLResponse:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from fastapi import FastAPI
 from starlette.responses import FileResponse
 
@@ -15,9 +17,15 @@ POLICY = (
 HEADERS = {"Cache-Control": "no-cache", "Content-Security-Policy": POLICY}
 
 
-def add_pages(app: FastAPI) -> None:
-    """Mount `/dataset`: the takes of the data folder."""
+def add_pages(app: FastAPI, prepare: Callable[[], None] = lambda: None) -> None:
+    """Mount `/dataset`: the takes of the data folder. `prepare` is called when somebody opens it."""
 
     @app.get("/dataset", include_in_schema=False)
-    async def read_dataset_page() -> FileResponse:
+    def read_dataset_page() -> FileResponse:
+        prepare()
         return FileResponse(WEB_ASSETS / "dataset.html", headers=HEADERS)
+
+    @app.get("/train", include_in_schema=False)
+    async def read_train_page() -> FileResponse:
+        """What is learned from them, and what came of it."""
+        return FileResponse(WEB_ASSETS / "train.html", headers=HEADERS)

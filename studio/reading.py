@@ -48,7 +48,10 @@ class Reader:
 
     def start(self) -> None:
         """Begin to start the process, so that the first who asks need not wait for that."""
-        self._submit(curves.prepare)
+        try:
+            self._submit(curves.prepare)
+        except BrokenProcessPool:
+            self._end_pool()
 
     def read(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Wait for what `function` returns or raises; a process that died meanwhile is started once more."""

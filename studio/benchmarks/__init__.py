@@ -25,6 +25,7 @@ PARTS = (
     "scene",
     "proxy",
     "review",
+    "view",
     "page",
     "policy",
 )
@@ -117,6 +118,8 @@ GOALS = (
     Goal(
         "scene", "poses of two arms, to a viewer [kB/s]", lambda r: r["two_arms_stream_kB_per_s"], "<=", 60.0
     ),
+    Goal("view", "60 s of two arms to the first frame, page [s]", lambda r: r["open_s"], "<=", 0.5),
+    Goal("view", "scrub step of three cameras, page [ms]", lambda r: r["scrub_ms"], "<=", 50.0),
     Goal("page", "first full render in Chromium [s]", lambda r: r["first_render_s"], "<=", 6.0),
     Goal(
         "gizmo",

@@ -23,9 +23,9 @@ export class Timeline {
     this.marks = takes.flatMap((take) => take.timeline.marks.map((mark) => ({ ...mark, take }))).sort((a, b) => this.at(a) - this.at(b));
     this.line = h("i", { class: "line" });
     this.shades = [h("i", { class: "shade" }), h("i", { class: "shade" })];
-    this.over = h("div", { class: "over" }, this.shades, this.line);
+    this.over = h("div", { class: "over" }, this.line);
     this.segments = this.isSingle ? new Segments(this, edit) : null;
-    this.element = h("div", { class: "lanes" }, [this.ruler, this.segments?.lane, ...this.bands(), this.events()].filter(Boolean).map((lane) => lane.element));
+    this.element = h("div", { class: "lanes" }, [this.ruler, this.segments?.lane, ...this.bands(), this.events()].filter(Boolean).map((lane) => lane.element), h("div", { class: "cut" }, this.shades));
     this.setSaid(null, []);
   }
 
@@ -207,6 +207,9 @@ export class Timeline {
     const [left, right] = [clamp(from, 0, 1), clamp(to, 0, 1)];
     place(this.shades[0], 0, left);
     place(this.shades[1], right, 1 - right);
+    const { style } = this.element.parentElement ?? this.element; // plots shade what they show, too
+    style.setProperty("--cut-in", `${100 * left}%`);
+    style.setProperty("--cut-out", `${100 * (1 - right)}%`);
     this.handles.forEach((handle, index) => {
       const share = [from, to][index];
       handle.style.left = `${100 * share}%`;
