@@ -27,7 +27,10 @@ export function ask(title, content, { button = null, act = null, kind = "", onCl
   }
   dialog.append(form);
   dialog.addEventListener("close", () => { dialog.remove(); onClose(); });
-  dialog.addEventListener("keydown", (event) => event.stopPropagation());
+  dialog.addEventListener("keydown", (event) => {
+    event.stopPropagation();
+    if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) form.requestSubmit();
+  });
   document.body.append(dialog);
   dialog.showModal();
   return dialog;
@@ -98,7 +101,7 @@ export function collect(words, { outcomes, health }, make) {
     h("p", {}, words), h("p", { class: "dim" }, outcomes), graded,
     h("div", { class: "fields" },
       h("label", { for: "name" }, "Name"),
-      h("input", { id: "name", name: "name", required: true, maxlength: "60", pattern: "[A-Za-z0-9][\\w.-]*", title: "Letters, digits, - _ .", autocomplete: "off" }),
+      h("input", { id: "name", name: "name", required: true, maxlength: "60", pattern: "[A-Za-z0-9][\\w.\\-]*", title: "Letters, digits, - _ .", autocomplete: "off" }),
       h("label", { for: "note" }, "Note"),
       h("textarea", { id: "note", name: "note", rows: "2" })),
     h("p", { class: "dim" }, "It keeps these takes as they are annotated now; later edits do not change it."),
@@ -113,7 +116,7 @@ export function collect(words, { outcomes, health }, make) {
       const { together, unexamined } = await health();
       const { good, fair, poor } = together.grades;
       graded.replaceChildren(
-        h("b", { class: `grade ${together.grade}` }, `● ${together.grade}`), ` · ${good} good, ${fair} fair, ${poor} poor`,
+        h("b", { class: `grade ${together.grade}` }, `${format.GRADE_SIGNS[together.grade]} ${together.grade}`), ` · ${good} good, ${fair} fair, ${poor} poor`,
         unexamined ? h("span", {}, ` · ${unexamined} not examined yet…`) : "",
         h("ul", {}, together.reasons.map((text) => h("li", {}, text))),
       );

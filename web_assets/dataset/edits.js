@@ -7,7 +7,9 @@ const NAME = "studio.author";
 
 // {outcome: "success"} of one take or many, signed; `done` hears the rows that came of it.
 export class Edits {
-  #api; #done; #undoable = []; // {words, undo}, the oldest first
+  #api; #done;
+  #undoable = []; // {words, undo}, the oldest first
+  #last = Promise.resolve(); // one after the other: who undoes at once means what was just asked for
 
   constructor(api, done) {
     [this.#api, this.#done] = [api, done];
@@ -20,15 +22,58 @@ export class Edits {
   get undoable() { return this.#undoable.at(-1)?.words ?? null; }
 
   // Say something about some takes; `words` tell people what. Each thousand of takes all or none.
-  async say(ids, changes, words) {
+  say(ids, changes, words) {
     const edit = { author: this.author, edit_id: newId(), ...changes };
-    const rows = await this.#post(ids, edit);
-    this.remember(words, () => this.#post(ids, { author: this.author, undo: edit.edit_id }));
-    return rows;
+    return this.#inTurn(async () => {
+      const rows = await this.#post(ids, edit);
+      this.remember(words, () => this.#post(ids, { author: edit.author, undo: edit.edit_id }));
+      return rows;
+    });
   }
 
   // Move takes to the trash, one by one. Those that cannot go are told in the end.
-  async remove(rows, isInsisting = false) {
+  remove(rows, isInsisting = false) {
+    return this.#inTurn(async () => {
+      const { gone, refused } = await this.#remove(rows, isInsisting);
+      if (gone.length) this.remember(`${subject(gone)} deleted`, () => this.#restore(gone));
+      return { gone, refused };
+    });
+  }
+
+  restore(rows) {
+    return this.#inTurn(async () => {
+      await this.#restore(rows);
+      this.remember(`${subject(rows)} restored`, () => this.#remove(rows, false));
+    });
+  }
+
+  // What was done, and how it is undone.
+  remember(words, undo) {
+    this.#undoable.push({ words, undo });
+  }
+
+  // Take back what was done last on this page; what it was, or null.
+  undo() {
+    return this.#inTurn(async () => {
+      const last = this.#undoable.pop();
+      if (!last) return null;
+      try {
+        await last.undo();
+      } catch (error) {
+        this.#undoable.push(last);
+        throw error;
+      }
+      return last.words;
+    });
+  }
+
+  #inTurn(act) {
+    const turn = this.#last.then(act);
+    this.#last = turn.catch(() => {});
+    return turn;
+  }
+
+  async #remove(rows, isInsisting) {
     const [gone, refused] = [[], []];
     for (const row of rows) {
       try {
@@ -39,39 +84,12 @@ export class Edits {
         refused.push({ row, error });
       }
     }
-    if (gone.length) {
-      this.remember(`${subject(gone)} deleted`, () => this.restore(gone, false));
-      this.#done(gone, true);
-    }
+    if (gone.length) this.#done(gone, true);
     return { gone, refused };
   }
 
-  async restore(rows, isUndoable = true) {
+  async #restore(rows) {
     for (const row of rows) await this.#api.post(`/episodes/${encodeURIComponent(row.episode_id)}/restore`);
-    if (isUndoable) this.remember(`${subject(rows)} restored`, () => this.#removeAgain(rows));
-    this.#done(rows, true);
-  }
-
-  // What was done, and how it is undone.
-  remember(words, undo) {
-    this.#undoable.push({ words, undo });
-  }
-
-  // Take back what was done last on this page; what it was, or null.
-  async undo() {
-    const last = this.#undoable.pop();
-    if (!last) return null;
-    try {
-      await last.undo();
-    } catch (error) {
-      this.#undoable.push(last);
-      throw error;
-    }
-    return last.words;
-  }
-
-  async #removeAgain(rows) {
-    for (const row of rows) await this.#api.del(`/episodes/${encodeURIComponent(row.episode_id)}`);
     this.#done(rows, true);
   }
 

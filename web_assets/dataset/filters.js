@@ -71,7 +71,7 @@ export class Filters {
     if (key !== "quality") return Object.entries(counted);
     let sum = 0;
     const entries = [5, 4, 3, 2, 1].map((q) => [`${q}`, sum += counted[q] ?? 0]);
-    return sum ? entries : [];
+    return sum ? entries.filter(([, n]) => n) : [];
   }
 
   #choice(key, value, n, most) {

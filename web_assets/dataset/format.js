@@ -5,6 +5,7 @@ import { h } from "./dom.js";
 export const OUTCOMES = ["success", "failure", "unmarked"];
 export const FLAGS = ["jittery", "hesitation", "excessive_force", "collision", "wrong_object"];
 export const GRADES = ["good", "fair", "poor"];
+export const GRADE_SIGNS = { good: "●", fair: "▲", poor: "✖" }; // never by their colour alone
 const SIGNS = { success: "✓", failure: "✗", unmarked: "○" };
 const DAY = 24 * 3600e3; // [ms]
 
@@ -54,9 +55,15 @@ export function stiffness(shares) {
     modes.map((mode) => h("i", { class: mode.replace(" control", ""), style: { flexGrow: shares[mode] } })));
 }
 
+// The worst finding decides; notes change nothing.
+export function gradeOf(findings) {
+  const has = (severity) => findings.some((found) => found.severity === severity);
+  return has("fault") ? "poor" : has("warning") ? "fair" : "good";
+}
+
 // {grade, findings} as a coloured dot that says why; empty where nobody examined it yet.
 export function grade(told) {
   if (!told) return h("span", { class: "grade", title: "Not examined yet" });
   const why = told.findings.map(({ text }) => text).join("\n") || "Nothing is wrong.";
-  return h("span", { class: `grade ${told.grade}`, title: `${told.grade}\n${why}`, "aria-label": told.grade }, "●");
+  return h("span", { class: `grade ${told.grade}`, title: `${told.grade}\n${why}`, "aria-label": told.grade }, GRADE_SIGNS[told.grade]);
 }

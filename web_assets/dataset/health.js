@@ -23,12 +23,12 @@ export function show(words, examine, { onGrades, open }) {
 
 function draw(content, together, unexamined, open) {
   const takes = together.takes.filter(({ findings }) => findings.length);
-  const worst = (found) => Math.max(...found.findings.map(({ severity }) => ["note", "warning", "fault"].indexOf(severity)));
-  takes.sort((a, b) => worst(b) - worst(a));
+  const badness = ({ findings }) => format.GRADES.indexOf(format.gradeOf(findings));
+  takes.sort((a, b) => badness(b) - badness(a));
   const n = together.takes.length;
   content.replaceChildren(
     unexamined ? h("p", { class: "progress" }, h("progress", { max: n + unexamined, value: n }), ` ${format.count(n)} of ${format.takes(n + unexamined)} examined`) : "",
-    h("p", { class: "verdict" }, h("b", { class: `grade ${together.grade}` }, `● ${together.grade}`),
+    h("p", { class: "verdict" }, h("b", { class: `grade ${together.grade}` }, `${format.GRADE_SIGNS[together.grade]} ${together.grade}`),
       ` ${together.reasons.join(" ") || "Nothing speaks against these takes."}`),
     h("div", { class: "shares" },
       shares("Grades", Object.fromEntries(format.GRADES.map((grade) => [grade, together.grades[grade]]).filter(([, k]) => k))),
@@ -50,10 +50,9 @@ function shares(title, counts) {
 }
 
 function line({ episode_id: id, findings }, open) {
-  const severities = findings.map(({ severity }) => severity);
-  const grade = severities.includes("fault") ? "poor" : severities.includes("warning") ? "fair" : "good";
+  const grade = format.gradeOf(findings);
   return h("tr", {},
-    h("td", {}, h("span", { class: `grade ${grade}`, title: grade }, "●")),
+    h("td", {}, h("span", { class: `grade ${grade}`, title: grade }, format.GRADE_SIGNS[grade])),
     h("td", {}, h("button", { type: "button", class: "link", onclick: () => open(id) }, id)),
     h("td", {}, findings.map(({ text, severity }) => h("div", { class: severity }, text))));
 }

@@ -1,7 +1,7 @@
 // The dataset page: the takes of a data folder, what people say about them, and one of them in view.
 
 import * as address from "./address.js";
-import { api } from "./api.js";
+import { api, Refused } from "./api.js";
 import * as dialogs from "./dialogs.js";
 import { attempt, h, isTyping, toast } from "./dom.js";
 import { Edits, subject } from "./edits.js";
@@ -20,34 +20,48 @@ const section = document.getElementById("episode");
 const start = address.read();
 const state = { filters: start.filters, source: start.source, episode: null }; // as the address says it
 let shown = null; // the row of the open take
-const rows = new Rows(api, () => table.draw());
+const rows = new Rows(api, () => table.follow());
 const table = new Table(document.getElementById("takes"), rows);
 const edits = new Edits(api, changed);
 let view = null; // of the open take, once one was opened
 let revision = null; // what the studio had when we asked last
+let isLooking = false;
 let isSettling = false; // the take under the cursor was edited: the list waits until the cursor leaves it
 
 // The list
 
-async function load({ toTop = false } = {}) {
+// `unless` is asked when the answer is here, and may drop it.
+async function load({ toTop = false, unless = () => false } = {}) {
   rows.source = state.source;
   rows.query = { ...state.filters, sort: rows.query.sort, descending: rows.query.descending };
-  const id = table.row?.episode_id;
   if (toTop) table.toTop();
   const [first, last] = table.span;
-  isSettling = false;
-  await Promise.all([rows.reload(first, Math.max(last, first + 50)), count()]);
-  if (!toTop) table.follow(id);
+  const reloaded = rows.reload(first, Math.max(last, first + 50), table.cursor, unless);
+  await Promise.all([reloaded, state.source.kind === "all" ? count() : reloaded.then(count)]);
   showBanner();
 }
 
 async function count() {
-  const [, amount] = await Promise.all([left.load(state.filters, state.source), api.get("/amount", state.filters)]);
-  toolbar.show(state.filters, amount);
+  const isAll = state.source.kind === "all";
+  const [, amount] = await Promise.all([left.load(state.filters, state.source), isAll && api.get("/amount", state.filters)]);
+  toolbar.show(isAll ? state.filters : {}, amount || rows.amount);
+}
+
+// What a command without a more exact aim is about: the selected takes, else all in the list.
+// Either `ids`, or for all that match the `filters` alone.
+function scope() {
+  const about = table.selected.size ? [...table.selected.values()] : state.source.kind === "all" ? null : rows.whole;
+  const words = table.selected.size ? `${format.takes(about.length)}, as selected` : format.takes(rows.total);
+  return { words, rows: about, ids: about?.map((row) => row.episode_id), filters: about ? null : state.filters };
+}
+
+function examine({ ids, filters }) {
+  return ids ? api.post("/dataset-health", { episode_ids: ids.slice(0, 1000) }) : api.get("/dataset-health", filters);
 }
 
 function ask(changes, isStep = false) {
   Object.assign(state, changes);
+  isSettling = false;
   table.select([]);
   remember(isStep);
   return attempt(() => load({ toTop: true }));
@@ -88,17 +102,31 @@ function emptyWords() {
     : h("span", {}, "No takes yet. Record some on the ", h("a", { href: "/", target: "_top" }, "studio's first page"), ", or: ", h("code", {}, "studio demo wiping --episodes 3"));
 }
 
+// The list as it is by now: the cursor has left the take that was edited.
+function settle() {
+  isSettling = false;
+  return attempt(() => load());
+}
+
 // What others do
 
 async function look() {
-  if (document.hidden) return;
+  if (document.hidden || isLooking) return;
+  isLooking = true;
+  try {
+    await lookOnce();
+  } finally {
+    isLooking = false;
+  }
+}
+
+async function lookOnce() {
   const { revision: now } = await api.get("/revision");
   if (now === revision) return;
-  const isFirst = revision === null;
-  revision = now;
-  if (isFirst) return;
+  const wasSettling = isSettling;
   if (isSettling) await Promise.all([rows.freshen(...table.span), count()]);
-  else await load();
+  else await load({ unless: () => isSettling });
+  if (!isSettling || wasSettling) revision = now; // else, and where it failed, the next look tries again
   known.clear();
   table.onRest(inView);
 }
@@ -108,11 +136,12 @@ async function look() {
 function changed(told, isElsewhere) {
   if (isElsewhere) {
     for (const row of told) table.selected.delete(row.episode_id);
-    attempt(() => load());
+    settle();
     return;
   }
   isSettling = true;
-  for (const row of told) rows.patch(row);
+  rows.patch(told);
+  if (told.some(({ episode_id: id }) => rows.placeOf(id) < 0)) settle(); // it may match again
   table.patch(told);
   if (view && state.episode) {
     const row = told.find(({ episode_id: id }) => id === state.episode);
@@ -122,16 +151,18 @@ function changed(told, isElsewhere) {
 
 // What keys and buttons are about: the open take, else the selected ones, else that under the cursor.
 function chosen() {
-  if (state.source.kind === "trash") throw new Error("A deleted take is not edited; restore it first.");
-  if (state.source.kind === "collection") throw new Error("A collection stays as it is; edit its takes under “All takes”.");
   if (shown) return [shown];
+  if (state.source.kind === "trash") throw new Refused(409, "A deleted take is not edited; restore it first (R).");
+  if (state.source.kind === "collection") throw new Refused(409, "A collection stays as it is; open a take of it, or edit under “All takes”.");
+  table.reveal();
   const found = table.chosen;
-  if (!found.length) throw new Error("No take is selected.");
+  if (!found.length) throw new Refused(409, "No take is selected.");
   return found;
 }
 
 async function say(changes, words) {
   const about = chosen();
+  isSettling = true;
   await edits.say(about.map((row) => row.episode_id), changes, `${subject(about)}: ${words}`);
   told(`${subject(about)}: ${words}`);
 }
@@ -164,7 +195,7 @@ const act = {
   }),
   remove: () => attempt(() => remove(chosen())),
   restore: () => attempt(async () => {
-    if (state.source.kind !== "trash") throw new Error("Only what is in the trash can be restored.");
+    if (state.source.kind !== "trash") throw new Refused(409, "Only what is in the trash can be restored.");
     const about = table.chosen;
     await edits.restore(about);
     table.select([]);
@@ -172,9 +203,8 @@ const act = {
   }),
   collect: () => attempt(collect),
   health: () => {
-    const about = [...table.selected.values()];
-    const examine = () => (about.length ? api.post("/dataset-health", { episode_ids: about.map((row) => row.episode_id).slice(0, 1000) }) : api.get("/dataset-health", state.filters));
-    health.show(about.length ? subject(about) : format.takes(rows.total), examine, { onGrades: learnGrades, open: openById });
+    const about = scope();
+    health.show(about.words, () => examine(about), { onGrades: learnGrades, open: openById });
   },
   compare: () => attempt(async () => {
     const about = [...table.selected.values()];
@@ -214,21 +244,25 @@ async function remove(about, isInsisting = false) {
 }
 
 function collect() {
-  const about = [...table.selected.values()];
-  const asked = Object.keys(state.filters).length ? state.filters : null;
-  if (!about.length && !asked) throw new Error("Select some takes, or ask for some by the filters on the left; that becomes the collection.");
-  const ids = about.map((row) => row.episode_id);
-  const words = about.length ? `${format.takes(about.length)}, as selected` : `${format.takes(rows.total)} that match the filters`;
-  const counted = (name) => about.filter((row) => row.outcome === name).length;
-  const outcomes = about.length ? format.OUTCOMES.filter(counted).map((name) => `${counted(name)} ${name}`).join(", ") : "";
-  const examine = () => (about.length ? api.post("/dataset-health", { episode_ids: ids.slice(0, 1000) }) : api.get("/dataset-health", asked));
-  dialogs.collect(words, { outcomes, health: examine }, async ({ name, note }) => {
-    const filters = asked && { ...asked, min_quality: asked.min_quality && Number(asked.min_quality) };
-    await api.post("/collections", { name, note, author: edits.author, ...(about.length ? { episode_ids: ids } : { filters }) });
+  if (state.source.kind === "trash") throw new Refused(409, "Deleted takes cannot be collected; restore them first.");
+  const about = scope();
+  if (about.filters && !Object.keys(about.filters).length) {
+    throw new Refused(409, "Select some takes, or ask for some by the filters on the left; that becomes the collection.");
+  }
+  const counted = (name) => about.rows.filter((row) => row.outcome === name).length;
+  const outcomes = about.rows ? format.OUTCOMES.filter(counted).map((name) => `${counted(name)} ${name}`).join(", ") : "All that match the filters.";
+  dialogs.collect(about.words, { outcomes, health: () => examine(about) }, async ({ name, note }) => {
+    const given = about.filters ? { filters: asNumbers(about.filters) } : { episode_ids: about.ids };
+    await api.post("/collections", { name, note, author: edits.author, ...given });
     edits.remember(`collection ${name} made`, () => api.del(`/collections/${encodeURIComponent(name)}`));
     told(`Collection ${name} made`);
     await count();
   });
+}
+
+// The address and the query know texts only.
+function asNumbers({ min_quality: quality, seed, ...filters }) {
+  return { ...filters, ...(quality && { min_quality: Number(quality) }), ...(seed && { seed: Number(seed) }) };
 }
 
 function deleteCollection(name) {
@@ -294,8 +328,7 @@ const known = new Set(); // ids that were asked for
 let inView = [];
 
 function learnGrades(found) {
-  const rank = (findings) => (findings.some(({ severity }) => severity === "fault") ? "poor" : findings.some(({ severity }) => severity === "warning") ? "fair" : "good");
-  for (const { episode_id: id, findings } of found) table.grades[id] = { grade: rank(findings), findings };
+  for (const { episode_id: id, findings } of found) table.grades[id] = { grade: format.gradeOf(findings), findings };
   table.draw();
 }
 
@@ -325,7 +358,7 @@ table.onSort = sort;
 table.onSelect = () => toolbar.showSelection([...table.selected.values()]);
 table.onMove = () => {
   if (state.episode && table.row) open(table.row, { isStep: false });
-  if (isSettling) attempt(() => load());
+  if (isSettling) settle();
 };
 
 document.addEventListener("keydown", (event) => {
@@ -359,13 +392,12 @@ document.getElementById("top").append(
   h("nav", {}, h("a", { href: "/", target: "_top" }, "Drive"), h("a", { href: "/dataset", class: "here" }, "Dataset")),
 );
 attempt(async () => {
-  await api.post("/refresh"); // takes that were copied into the folder
-}).then(() => attempt(async () => {
   await load({ toTop: true });
   if (start.episode) await openById(start.episode);
   table.focus();
+  api.post("/refresh").catch(() => {}); // takes that were copied into the folder; `look` hears of them
   for (;;) {
-    await look().catch(() => {}); // a studio that ends tells by itself that it does not answer
+    await look().catch(() => {}); // without an answer the next look may have one
     await new Promise((resolve) => { setTimeout(resolve, LOOK); });
   }
-}));
+});

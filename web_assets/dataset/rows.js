@@ -13,6 +13,7 @@ export class Rows {
   #wanted = new Set();
   #timer = 0;
   #turn = 0; // counts what was asked anew; answers of before are dropped
+  #line = Promise.resolve(); // one request after the other: no old answer comes after a newer one
 
   constructor(api, onChange) {
     [this.#api, this.#onChange] = [api, onChange];
@@ -27,6 +28,16 @@ export class Rows {
     return page?.[place % PAGE];
   }
 
+  // All of them, where they come in one piece.
+  get whole() { return this.#whole; }
+
+  get amount() {
+    const rows = this.#whole ?? [];
+    const counted = (outcome) => rows.filter((row) => row.outcome === outcome).length;
+    const seconds = rows.reduce((sum, row) => sum + row.duration, 0);
+    return { takes: rows.length, seconds, successes: counted("success"), failures: counted("failure") };
+  }
+
   // The place of a take among those that are here, else -1.
   placeOf(id) {
     if (this.#whole) return this.#whole.findIndex((row) => row.episode_id === id);
@@ -37,42 +48,28 @@ export class Rows {
     return -1;
   }
 
-  // What else is known of a take that was changed.
-  patch(row) {
-    const place = this.placeOf(row.episode_id);
-    if (place < 0) return;
-    if (this.#whole) this.#whole[place] = row;
-    else this.#pages.get(Math.floor(place / PAGE))[place % PAGE] = row;
+  // Takes as they are by now, where they are here.
+  patch(rows) {
+    for (const row of rows) {
+      const place = this.placeOf(row.episode_id);
+      if (place < 0) continue;
+      if (this.#whole) this.#whole[place] = row;
+      else this.#pages.get(Math.floor(place / PAGE))[place % PAGE] = row;
+    }
     this.#onChange();
   }
 
-  // Ask anew for the places `first` to `last`, and forget the others. What is shown stays until the answer.
-  async reload(first = 0, last = PAGE) {
+  // Ask anew for the places `first` to `last` and that of the cursor, and forget the others. What is shown stays
+  // until the answer.
+  reload(first, last, cursor, unless) {
     const turn = ++this.#turn;
-    if (this.source.kind !== "all") {
-      const rows = sorted(await this.#fetchWhole(), this.query);
-      if (turn === this.#turn) [this.#whole, this.total] = [rows, rows.length];
-    } else {
-      const numbers = range(Math.floor(first / PAGE), Math.floor(Math.max(first, last - 1) / PAGE));
-      const answers = await Promise.all(numbers.map((number) => this.#fetch(number)));
-      if (turn !== this.#turn) return;
-      this.#whole = null;
-      this.#pages = new Map(numbers.map((number, index) => [number, answers[index].episodes]));
-      this.total = answers[0].total;
-    }
-    if (turn === this.#turn) this.#onChange();
+    return this.#inLine(() => turn === this.#turn && this.#reload(() => turn !== this.#turn || unless(), first, last, cursor));
   }
 
   // What others said about the takes that are here, without moving any of them.
-  async freshen(first, last) {
-    if (this.#whole) return;
+  freshen(first, last) {
     const turn = this.#turn;
-    const numbers = range(Math.floor(first / PAGE), Math.floor(Math.max(first, last - 1) / PAGE));
-    for (const number of numbers) {
-      const { episodes } = await this.#fetch(number);
-      if (turn !== this.#turn) return;
-      episodes.forEach((row) => this.patch(row));
-    }
+    return this.#inLine(() => turn === this.#turn && !this.#whole && this.#freshen(turn, first, last));
   }
 
   // The first of all that match, at most so many of them.
@@ -84,6 +81,37 @@ export class Rows {
       found.push(...episodes);
     }
     return found;
+  }
+
+  #inLine(act) {
+    const turn = this.#line.then(act);
+    this.#line = turn.catch(() => {});
+    return turn;
+  }
+
+  async #reload(isDropped, first, last, cursor) {
+    if (this.source.kind !== "all") {
+      const rows = sorted(await this.#fetchWhole(), this.query);
+      if (isDropped()) return;
+      [this.#whole, this.total] = [rows, rows.length];
+    } else {
+      const numbers = range(Math.floor(first / PAGE), Math.floor(Math.max(first, last - 1) / PAGE));
+      if (!numbers.includes(Math.floor(cursor / PAGE))) numbers.push(Math.floor(cursor / PAGE));
+      const answers = await Promise.all(numbers.map((number) => this.#fetch(number)));
+      if (isDropped()) return;
+      this.#whole = null;
+      this.#pages = new Map(numbers.map((number, index) => [number, answers[index].episodes]));
+      this.total = answers[0].total;
+    }
+    this.#onChange();
+  }
+
+  async #freshen(turn, first, last) {
+    for (const number of range(Math.floor(first / PAGE), Math.floor(Math.max(first, last - 1) / PAGE))) {
+      const { episodes } = await this.#fetch(number);
+      if (turn !== this.#turn) return;
+      this.patch(episodes);
+    }
   }
 
   #want(number) {

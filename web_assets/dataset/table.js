@@ -19,8 +19,8 @@ const COLUMNS = [
   ["outcome", "Outcome", "outcome"],
   ["quality", "Quality", "quality"],
   ["flags", "Flags", null],
-  ["peak", "Peak", "peak_force"],
-  ["mean", "Mean", "mean_force"],
+  ["peak", "Peak N", "peak_force"],
+  ["mean", "Mean N", "mean_force"],
   ["stiffness", "Stiffness", null],
   ["health", "", null],
   ["date", "Recorded", "started"],
@@ -47,6 +47,7 @@ export class Table {
   #frame = 0;
   #anchor = 0; // where a range of selected rows began
   #openId = null;
+  #id; // of the take under the cursor; undefined until it is here
 
   constructor(container, rows) {
     this.#rows = rows;
@@ -90,26 +91,35 @@ export class Table {
       if (!this.selected.size) this.#anchor = from;
       this.selectRange(this.#anchor, this.cursor);
     }
+    this.#id = this.row?.episode_id;
     this.#bringIntoView();
     this.draw();
     if (!isQuiet && (this.cursor !== from || isRange)) this.onMove();
   }
 
-  // After the list was asked anew: the cursor stays on its take, and that where it was on the screen.
-  follow(id) {
-    const place = id === undefined ? -1 : this.#rows.placeOf(id);
+  // Whenever rows have changed: the cursor stays on its take, and that where it was on the screen. Between
+  // the two no key may come, or it would be about another take.
+  follow() {
+    const place = this.#id === undefined ? -1 : this.#rows.placeOf(this.#id);
     if (place >= 0 && place !== this.cursor) {
-      this.#body.scrollTop += HEIGHT * (place - this.cursor);
+      const steps = place - this.cursor;
       this.cursor = place;
+      this.#space.style.height = `${HEIGHT * this.#rows.total}px`;
+      this.#body.scrollTop += HEIGHT * steps;
     }
     this.cursor = Math.max(0, Math.min(this.cursor, this.#rows.total - 1));
+    this.#id = this.row?.episode_id ?? this.#id;
     this.draw();
   }
 
   toTop() {
     this.cursor = this.#anchor = 0;
+    this.#id = undefined;
     this.#body.scrollTop = 0;
   }
+
+  // The cursor, wherever one has scrolled.
+  reveal() { this.#bringIntoView(); }
 
   toggle(place) {
     const row = this.#rows.at(place);
@@ -198,7 +208,8 @@ export class Table {
         return row.cameras.length && this.#rows.source.kind !== "trash" ? image ?? this.#picture(row, isPictured) : null;
       case "task":
         return [h("b", { title: row.episode_id }, format.name(row)),
-          h("small", { title: row.note || row.instruction }, row.note || row.instruction)];
+          h("small", { class: row.note ? "note" : "instruction", title: row.note || row.instruction }, row.note || row.instruction),
+          h("small", { class: "brief" }, `${format.seconds(row.duration)} · ${row.peak_force.toFixed(1)} N · ${format.date(row.started)}`)];
       case "operator": return [h("span", { title: row.operator }, row.operator), h("small", {}, row.agent)];
       case "length": return format.seconds(row.duration);
       case "outcome": return format.outcome(row.outcome);
@@ -252,11 +263,11 @@ export class Table {
     const row = this.#rows.at(place);
     if (!row) return;
     if (event.target.closest("input[type=checkbox], .check") || event.ctrlKey || event.metaKey) {
-      this.cursor = place;
+      this.moveTo(place);
       this.toggle(place);
     } else if (event.shiftKey) {
       if (!this.selected.size) this.#anchor = this.cursor;
-      this.cursor = place;
+      this.moveTo(place);
       this.selectRange(this.#anchor, place);
     } else {
       this.#anchor = place;
