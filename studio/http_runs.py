@@ -12,12 +12,13 @@ from pydantic import Field
 from starlette.responses import Response
 
 from policy.config import TrainConfig
-from studio import evaluation, report, runs, tasks
+from studio import evaluation, report, runs, tasks, training
 from studio.api import Studio
 from studio.benchmarks.policy import step_seconds
 from studio.evaluation import Comparison, Evaluation, compare
 from studio.http_jobs import config_of
-from studio.http_wire import Body, Name, Problem, as_json, refusals
+from studio.http_wire import Body, FiltersIn, Name, Problem, as_json, refusals
+from studio.index import EpisodeRow
 from studio.jobs.form import train_form
 from studio.jobs.plans import default_threads
 from studio.reading import Reader
@@ -47,6 +48,15 @@ class Paired:
     comparison: Comparison
     text: str
     scenes: list[dict[str, Any]]  # of each seed: what came of it in one and in the other
+
+
+class TakesIn(Body):
+    """Takes that somebody thinks of learning from, as for a job of training."""
+
+    task: Name
+    episodes: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    filters: FiltersIn | None = None
+    collection: Name | None = None
 
 
 class EstimateIn(Body):
@@ -118,6 +128,19 @@ def _runs_router(studio: Studio) -> APIRouter:
     def read_settings() -> Response:
         """All settings of training as JSON schema, with the help of the command line, and the presets."""
         return as_json(train_form())
+
+    @router.post("/train-takes", response_model=list[EpisodeRow])
+    def list_takes(body: TakesIn) -> Response:
+        """What a run would learn from: without rollouts, and what else a policy drove. 422 says why none."""
+        with refusals():
+            found = training.choose(
+                studio.catalog,
+                body.task,
+                episodes=body.episodes,
+                filters=body.filters.filters() if body.filters else None,
+                collection=body.collection,
+            )
+            return as_json(found)
 
     @router.post("/train-estimate", response_model=Estimate)
     def estimate(body: EstimateIn) -> Response:

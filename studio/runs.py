@@ -161,7 +161,7 @@ class _Told:
         self.step, self.damaged, self._offset = 0.0, 0, 0
 
     def follow(self, path: Path) -> bool:
-        """Read what was added; False where the file is another one by now, as a resumed run begins it anew."""
+        """Read what was added; False where the file is another one by now, as of a resumed run."""
         try:
             with path.open("rb") as file:
                 if file.seek(0, 2) < self._offset:

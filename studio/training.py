@@ -99,6 +99,20 @@ def prepare(
     folder = catalog.data_dir / "runs" / name
     if folder.exists() and leads():
         raise ValueError(f"There is a run {name} already; resume it, or give another name.")
+    rows = choose(catalog, task, episodes=episodes, filters=filters, collection=collection)
+    takes = tuple(Chosen(row.episode_id, row.trim, row.edit_version) for row in rows)
+    return Run(folder, task, config, takes)
+
+
+def choose(
+    catalog: Catalog,
+    task: str,
+    *,
+    episodes: int | None = None,
+    filters: Filters | None = None,
+    collection: str | None = None,
+) -> list[EpisodeRow]:
+    """What a run would learn from, see `prepare`."""
     catalog.refresh()
     rows = (
         _named(catalog, task, collection, filters)
@@ -107,8 +121,7 @@ def prepare(
     )
     if episodes is not None and not 1 <= episodes <= len(rows):
         raise ValueError(f"{len(rows)} takes match, so that many or fewer can be asked for, not {episodes}.")
-    takes = tuple(Chosen(row.episode_id, row.trim, row.edit_version) for row in rows[:episodes])
-    return Run(folder, task, config, takes)
+    return rows[:episodes]
 
 
 def reopen(catalog: Catalog, name: str) -> Run:

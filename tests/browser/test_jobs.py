@@ -1,0 +1,157 @@
+"""The page of jobs in a browser: from takes to a policy that was tried, as a person does it."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Error, Page, ViewportSize, expect
+from test_http import Site
+
+from studio.api import Studio
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=30e3)  # [ms] for a page on a busy machine
+LONG = 120e3  # [ms] for a job on a busy machine
+SMALL = {"Width": "16", "Feedforward": "32", "Heads": "2", "Encoder layers": "1", "Decoder layers": "1"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """With six demonstrations, and a queue that goes on."""
+    data = tmp_path_factory.mktemp("jobs")
+    with Studio(data) as studio:
+        studio.demo("wiping", episodes=6, seed=7, cameras=False)
+    site = Site(data)
+    site.studio.catalog.refresh()
+    with site.studio.jobs.kept_going():
+        yield site
+    site.close()
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Browser) -> Iterator[Page]:
+    """One for all tests; they fail where its scripts do."""
+    context = chromium.new_context(viewport=ViewportSize(width=1280, height=800))
+    page = context.new_page()
+    page.set_default_timeout(60e3)
+    errors: list[Error] = []
+    page.on("pageerror", lambda error: errors.append(error))
+    yield page
+    context.close()
+    assert not errors
+
+
+def look(page: Page, name: str) -> None:
+    """Keep a picture where somebody asks for them."""
+    if folder := os.environ.get("STUDIO_SCREENSHOTS"):
+        page.screenshot(path=Path(folder) / f"{name}.png")
+
+
+def test_from_takes_to_a_policy_that_was_tried(site: Site, page: Page) -> None:
+    ids = [row.episode_id for row in site.studio.episodes()]
+    site.studio.make_collection("six", episode_ids=ids)
+    page.goto(f"{site.front.url}/train")
+    form = page.locator("#ask")
+    expect(form.get_by_text("6 takes")).to_be_visible()
+    form.get_by_label("From").select_option("collection")
+    expect(form.get_by_label("Collection")).to_have_value("six")
+    form.get_by_label("Images").uncheck()
+    form.get_by_label("Steps", exact=True).fill("60")
+    form.get_by_text("Network", exact=True).click()
+    for name, value in SMALL.items():
+        form.get_by_label(name, exact=True).fill(value)
+    form.get_by_text("Optimisation", exact=True).click()
+    form.get_by_label("Validate every").fill("20")
+    form.get_by_label("Name", exact=True).fill("learner")
+    form.get_by_role("button", name="Start training").click()
+    job = page.locator(".job", has_text="Train learner")
+    expect(job.locator(".state")).to_have_text("running")
+    closer = page.locator("#closer")
+    expect(closer.locator(".chart canvas").first).to_be_visible(timeout=LONG)
+    expect(job.locator(".state")).to_have_text("done", timeout=LONG)
+    expect(closer.get_by_text("step 60 of 60", exact=True)).to_be_visible()
+    expect(closer.get_by_role("link", name="collection six")).to_have_attribute(
+        "href", "/dataset?collection=six"
+    )
+    expect(closer.locator(".chart:visible")).to_have_count(5)
+    expect(closer.locator(".log")).to_contain_text("on others")
+    look(page, "train")
+    # Evaluate what it learned.
+    closer.get_by_role("button", name="Evaluate…").click()
+    expect(form.get_by_label("Run or reference")).to_have_value("learner")
+    form.get_by_label("How many").fill("2")
+    form.get_by_role("button", name="Start evaluation").click()
+    tried = page.locator(".job", has_text="Evaluate learner on wiping")
+    expect(closer.locator("table.rollouts tbody tr").first).to_be_visible(timeout=LONG)  # before all are over
+    expect(tried.locator(".state")).to_have_text("done", timeout=LONG)
+    expect(closer.get_by_text("at step 60")).to_be_visible()
+    rollouts = closer.locator("table.rollouts tbody tr")
+    expect(rollouts).to_have_count(2)
+    rollout = site.studio.evaluation("learner").rollouts[0]
+    link = rollouts.first.get_by_role("link", name="open")
+    expect(link).to_have_attribute("href", f"/dataset?episode={rollout.episode_id}")
+    expect(closer.locator("img.figure").first).to_have_js_property("complete", True)
+    look(page, "evaluate")
+
+
+def test_a_run_is_duplicated_compared_deleted_and_restored(site: Site, page: Page) -> None:
+    page.goto(f"{site.front.url}/train")
+    form, job = page.locator("#ask"), page.locator(".job", has_text="Train learner")
+    job.get_by_role("button", name="Duplicate…").click()
+    expect(form.get_by_label("Steps", exact=True)).to_have_value("60")
+    form.get_by_text("Run", exact=True).click()
+    form.get_by_label("Name", exact=True).fill("second")
+    form.get_by_label("Sweep over").select_option("lr")
+    form.get_by_placeholder("values, e.g. 1e-4, 5e-4").fill("1e-3")
+    form.get_by_label("Steps", exact=True).fill("30")
+    form.get_by_role("button", name="Start training").click()
+    job = page.locator(".job", has_text="Train second-1")
+    expect(job.locator(".state")).to_have_text("done", timeout=LONG)
+    page.get_by_role("button", name="second-1", exact=True).click()
+    page.get_by_label("Compare learner").check()
+    closer = page.locator("#closer")
+    expect(closer.get_by_role("heading", name="2 runs")).to_be_visible()
+    expect(closer.locator("th", has_text="lr")).to_be_visible()
+    look(page, "compare")
+    job.get_by_role("button", name="Delete").click()
+    expect(page.locator(".job", has_text="Train second-1")).to_have_count(0)
+    assert "second-1" not in {path.name for path in (site.studio.data_dir / "runs").iterdir()}
+    page.get_by_role("button", name="Undo").click()
+    expect(page.locator(".job", has_text="Train second-1")).to_be_visible()
+    assert "second-1" in {path.name for path in (site.studio.data_dir / "runs").iterdir()}
+
+
+def test_two_agents_are_compared_on_the_same_scenes(site: Site, page: Page) -> None:
+    one = site.studio.evaluation("learner").evaluation_id
+    page.goto(f"{site.front.url}/train?view=evaluate")
+    form, closer = page.locator("#ask"), page.locator("#closer")
+    form.get_by_label("Run or reference").select_option("demonstrator")
+    form.get_by_label("Task").select_option("wiping")
+    form.get_by_label("How many").fill("2")
+    form.get_by_role("button", name="Start evaluation").click()
+    expect(closer.get_by_label("Compare with")).to_be_visible(timeout=LONG)
+    closer.get_by_label("Compare with").select_option(one)
+    expect(closer.get_by_text("Paired difference")).to_be_visible()
+    expect(closer.get_by_text(re.compile(r"demonstrator against learner on 2 scenes"))).to_be_visible()
+    assert f"against={one}" in page.url
+    look(page, "paired")
+
+
+def test_what_cannot_work_is_told_in_a_sentence(site: Site, page: Page) -> None:
+    page.goto(f"{site.front.url}/train")
+    form = page.locator("#ask")
+    expect(form.get_by_text("6 takes")).to_be_visible()
+    form.get_by_label("Steps", exact=True).fill("many")
+    form.get_by_role("button", name="Start training").click()
+    expect(page.locator(".toast")).to_contain_text("Steps must be a number, not “many”.")
+    form.get_by_label("Steps", exact=True).fill("10")
+    form.get_by_label("Name", exact=True).fill("learner")
+    form.get_by_role("button", name="Start training").click()
+    expect(page.locator(".toast").last).to_contain_text("There is a run learner already")
+    form.get_by_label("Task").select_option("drawing")
+    expect(form.get_by_text("No demonstration of 'drawing'")).to_be_visible()
+    expect(form.get_by_role("button", name="Start training")).to_be_disabled()

@@ -1,0 +1,115 @@
+// Everything that was asked for, with how far it is; below it, the runs or evaluations that there are.
+
+import { api } from "../dataset/api.js";
+import { attempt, h, toast } from "../dataset/dom.js";
+import { date, exactDate } from "../dataset/format.js";
+import { duration } from "./fields.js";
+
+const ACTIVE = ["queued", "running", "lost"];
+const SIGNS = { queued: "◷", running: "▶", done: "✓", failed: "✗", cancelled: "–", interrupted: "!", lost: "?" };
+
+export class JobList {
+  constructor(section, act) {
+    this.act = act;
+    this.jobs = h("div", { class: "list" });
+    this.results = h("div", { class: "list" });
+    this.trash = h("button", { class: "link", onclick: () => attempt(() => this.showTrash()) }, "Trash");
+    section.append(h("div", { class: "title" }, h("h2", {}, "Jobs"), this.trash), this.jobs, this.results);
+  }
+
+  show({ view, jobs, runs, evaluations, chosen }) {
+    const told = JSON.stringify([view, jobs, runs.map((run) => [run.name, run.step, run.best]), evaluations.length, chosen]);
+    if (told === this.told) return;
+    this.told = told;
+    const isOf = ({ job, standing }) => ACTIVE.includes(standing.state) || job.job_id === chosen.job || (view === "evaluate") === (job.kind === "evaluate");
+    jobs = jobs.filter(isOf);
+    const focused = document.activeElement?.dataset.key;
+    this.jobs.replaceChildren(...(jobs.length ? jobs.map((now) => this.row(now, chosen)) : [h("p", { class: "dim" }, "Nothing was asked for yet.")]));
+    this.results.replaceChildren(...(view === "train" ? this.runsOf(runs, jobs, chosen) : this.evaluationsOf(evaluations, chosen)));
+    if (focused) document.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
+  }
+
+  row(now, chosen) {
+    const { job, standing, progress } = now;
+    const isHere = chosen.job === job.job_id;
+    return h("article", { class: `job ${standing.state}${isHere ? " here" : ""}`, "data-job": job.job_id },
+      h("button", { class: "name", "data-key": job.job_id, "aria-current": isHere ? "true" : null, onclick: () => this.act.open(now) },
+        h("i", { "aria-hidden": "true" }, SIGNS[standing.state]), h("b", {}, job.title), sweptOf(job)),
+      h("span", { class: "state", title: standing.why }, standing.state),
+      h("span", { class: "when", title: exactDate(job.created) }, `${date(job.created)} · ${job.author}`),
+      progressOf(now),
+      standing.why && h("p", { class: "why" }, standing.why),
+      h("div", { class: "acts" }, this.actsOf(now)));
+  }
+
+  actsOf(now) {
+    const { job, standing } = now;
+    const isActive = ACTIVE.includes(standing.state);
+    const post = (verb, text) => () => attempt(async () => { await api.post(`/jobs/${job.job_id}/${verb}`); if (text) toast(text); this.act.changed(); });
+    return [
+      isActive && h("button", { onclick: post("cancel", job.kind === "train" && standing.state === "running" ? "It saves a checkpoint, then ends." : null) }, "Cancel"),
+      !isActive && standing.state !== "done" && h("button", { onclick: post("resume") }, job.kind === "train" ? "Resume" : "Again"),
+      ["train", "evaluate"].includes(job.kind) && h("button", { onclick: () => this.act.again(now) }, "Duplicate…"),
+      !isActive && h("button", { class: "danger", onclick: () => attempt(() => this.remove(job)) }, "Delete"),
+    ];
+  }
+
+  async remove(job) {
+    await api.del(`/jobs/${job.job_id}`);
+    const undo = { label: "Undo", act: () => attempt(async () => { await api.post(`/jobs/${job.job_id}/restore`); this.act.changed(); }) };
+    toast(`${job.title} is in the trash${job.kind === "train" ? ", with its run" : ""}.`, { action: undo });
+    this.act.changed();
+  }
+
+  async showTrash() {
+    const found = await api.get("/jobs-trash");
+    if (!found.length) return toast("The trash is empty.");
+    const dialog = h("dialog", {}, h("header", {}, h("h2", {}, "Deleted jobs"), h("button", { class: "close", "aria-label": "Close", onclick: () => dialog.close() }, "×")),
+      h("div", { class: "content" }, found.map((job) => h("p", { class: "trashed" }, h("span", {}, job.title, h("small", { class: "dim" }, ` ${date(job.created)}`)),
+        h("button", { onclick: () => attempt(async () => { await api.post(`/jobs/${job.job_id}/restore`); dialog.close(); this.act.changed(); }) }, "Restore")))));
+    dialog.addEventListener("close", () => dialog.remove());
+    document.body.append(dialog);
+    return dialog.showModal();
+  }
+
+  runsOf(runs, jobs, chosen) {
+    if (!runs.length) return [];
+    return [h("div", { class: "title" }, h("h2", {}, "Runs"), h("small", { class: "dim" }, "tick several to compare their curves")),
+      h("table", {}, h("thead", {}, h("tr", {}, ["", "Run", "Step", "Takes", "Best on others"].map((text) => h("th", {}, text)))),
+        h("tbody", {}, runs.map((run) => h("tr", { class: chosen.runs.includes(run.name) ? "here" : "" },
+          h("td", {}, h("input", { type: "checkbox", "data-key": `tick ${run.name}`, "aria-label": `Compare ${run.name}`, checked: chosen.runs.includes(run.name), onchange: () => this.act.openRun(run.name, true) })),
+          h("td", {}, h("button", { class: "link", "data-key": `run ${run.name}`, title: run.problem, onclick: () => this.act.openRun(run.name, false) }, run.name), run.problem && h("span", { class: "why" }, " ▲")),
+          h("td", { class: "number" }, `${run.step} / ${run.steps}`),
+          h("td", { class: "number" }, String(run.takes.length)),
+          h("td", { class: "number" }, run.best === null ? "–" : run.best.toFixed(4))))))];
+  }
+
+  evaluationsOf(evaluations, chosen) {
+    if (!evaluations.length) return [];
+    return [h("div", { class: "title" }, h("h2", {}, "Evaluations")),
+      h("table", {}, h("thead", {}, h("tr", {}, ["Agent", "Task", "Success", "95 %", "Force", ""].map((text) => h("th", {}, text)))),
+        h("tbody", {}, evaluations.map((told) => h("tr", { class: chosen.evaluation === told.evaluation ? "here" : "" },
+          h("td", {}, h("button", { class: "link", "data-key": told.evaluation, onclick: () => this.act.openEvaluation(told.evaluation) }, told.label), told.step ? h("small", { class: "dim" }, ` step ${told.step}`) : ""),
+          h("td", {}, told.task),
+          h("td", { class: "number" }, `${told.successes} / ${told.episodes}`),
+          h("td", { class: "number" }, interval(told.wilson_95)),
+          h("td", { class: "number" }, `${told.force_mean_N.toFixed(1)} N`),
+          h("td", { class: "dim" }, date(told.started))))))];
+  }
+}
+
+export const interval = ([low, high]) => `${Math.round(100 * low)}–${Math.round(100 * high)} %`;
+
+const sweptOf = ({ swept }) => Object.entries(swept).map(([name, value]) => h("span", { class: "tag" }, `${name.replaceAll("_", " ")} ${value}`));
+
+const WHAT = { train: "steps", evaluate: "rollouts", demo: "takes", export: "%" };
+
+export function progressOf({ job, standing, progress, seconds_left: left }) {
+  if (!progress || standing.state === "queued") return null;
+  const share = progress.total ? Math.min(1, progress.done / progress.total) : 0;
+  const done = job.kind === "export" ? `${Math.round(100 * share)} %` : `${Math.round(progress.done)} of ${Math.round(progress.total)} ${WHAT[job.kind]}`;
+  const rest = standing.state !== "running" ? "" : left ? `, ${duration(left)} left` : progress.what ? `, ${progress.what}` : ", begins";
+  return h("div", { class: "progress", title: progress.what },
+    h("div", { class: "track", role: "progressbar", "aria-valuenow": Math.round(100 * share), "aria-valuemin": 0, "aria-valuemax": 100, "aria-label": job.title }, h("i", { style: { width: `${100 * share}%` } })),
+    h("small", {}, done + rest));
+}
