@@ -29,7 +29,7 @@ function draw(content, together, unexamined, open) {
   content.replaceChildren(
     unexamined ? h("p", { class: "progress" }, h("progress", { max: n + unexamined, value: n }), ` ${format.count(n)} of ${format.takes(n + unexamined)} examined`) : "",
     h("p", { class: "verdict" }, h("b", { class: `grade ${together.grade}` }, `${format.GRADE_SIGNS[together.grade]} ${together.grade}`),
-      ` ${together.reasons.join(" ") || "Nothing speaks against these takes."}`),
+      ` ${together.reasons.join(" ") || "Nothing speaks against it."}`),
     h("div", { class: "shares" },
       shares("Grades", Object.fromEntries(format.GRADES.map((grade) => [grade, together.grades[grade]]).filter(([, k]) => k))),
       ...Object.entries(together.balance).map(([name, counts]) => shares({ agent: "Driven by" }[name] ?? name, counts))),

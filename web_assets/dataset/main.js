@@ -5,6 +5,7 @@ import { api, Refused } from "./api.js";
 import * as dialogs from "./dialogs.js";
 import { attempt, h, isTyping, toast } from "./dom.js";
 import { Edits, subject } from "./edits.js";
+import * as exports from "./export.js";
 import { Filters } from "./filters.js";
 import * as format from "./format.js";
 import * as health from "./health.js";
@@ -51,7 +52,8 @@ async function count() {
 // Either `ids`, or for all that match the `filters` alone.
 function scope() {
   const about = table.selected.size ? [...table.selected.values()] : state.source.kind === "all" ? null : rows.whole;
-  const words = table.selected.size ? `${format.takes(about.length)}, as selected` : format.takes(rows.total);
+  const isFiltered = state.source.kind === "all" && Object.keys(state.filters).length;
+  const words = table.selected.size ? `${format.takes(about.length)}, as selected` : `${format.takes(rows.total)}${isFiltered ? " that match" : ""}`;
   return { words, rows: about, ids: about?.map((row) => row.episode_id), filters: about ? null : state.filters };
 }
 
@@ -203,7 +205,7 @@ const act = {
   }),
   collect: () => attempt(collect),
   health: () => {
-    const about = scope();
+    const about = shown ? { words: subject([shown]), ids: [shown.episode_id] } : scope();
     health.show(about.words, () => examine(about), { onGrades: learnGrades, open: openById });
   },
   compare: () => attempt(async () => {
@@ -212,8 +214,18 @@ const act = {
     document.body.classList.add("viewing");
     (await theView()).compare(about);
   }),
-  export: () => {},
-  canExport: () => false,
+  export: () => attempt(async () => {
+    if (state.source.kind === "trash") throw new Refused(409, "Deleted takes are not exported; restore them first.");
+    const about = scope();
+    const { kind, name } = state.source;
+    const isAll = about.filters && !Object.keys(about.filters).length;
+    if (isAll && rows.total > MOST_SELECTED) throw new Refused(409, `These are ${format.takes(rows.total)}; ask for some of them by the filters on the left.`);
+    const which = kind === "collection" && !table.selected.size ? { collection: name }
+      : about.filters && !isAll ? { filters: asNumbers(about.filters) }
+      : { episode_ids: about.ids ?? (await rows.first(MOST_SELECTED)).map((row) => row.episode_id) };
+    const known = new Set((about.rows ?? [table.row]).map((row) => row?.task));
+    exports.start({ words: about.words, task: known.size === 1 ? [...known][0] : undefined, ...which }, edits.author);
+  }),
   help: () => attempt(async () => dialogs.help((await theView()).keys)),
   sign: () => dialogs.ask("Your name", h("div", { class: "fields" }, h("label", { for: "author" }, "Name"),
     h("input", { id: "author", name: "author", required: true, maxlength: "60", value: edits.author, autocomplete: "name" })),
@@ -395,6 +407,7 @@ attempt(async () => {
   await load({ toTop: true });
   if (start.episode) await openById(start.episode);
   table.focus();
+  exports.followAll().catch(() => {});
   api.post("/refresh").catch(() => {}); // takes that were copied into the folder; `look` hears of them
   for (;;) {
     await look().catch(() => {}); // without an answer the next look may have one

@@ -30,7 +30,7 @@ export class Toolbar {
         h("span", { class: "buttons" },
           h("button", { onclick: () => act.health() }, "Health…"),
           h("button", { onclick: () => act.collect() }, "Collect…"),
-          h("button", { class: "export", hidden: true, onclick: () => act.export() }, "Export…"),
+          h("button", { class: "export", onclick: () => act.export() }, "Export…"),
           this.#author,
           h("button", { class: "help", title: "Keys (?)", "aria-label": "Keys", onclick: () => act.help() }, "?"))),
       this.#banner, this.#selection);
@@ -39,8 +39,6 @@ export class Toolbar {
   set author(name) { this.#author.textContent = name; }
 
   focusSearch() { this.#search.focus(); this.#search.select(); }
-
-  canExport() { document.querySelectorAll("button.export").forEach((button) => { button.hidden = false; }); }
 
   show(filters, amount) {
     if (document.activeElement !== this.#search) this.#search.value = filters.text ?? "";
@@ -73,7 +71,7 @@ export class Toolbar {
       button("Edit…", () => act.edit(), "E"),
       button("Collect…", () => act.collect(), "C"),
       rows.length > 1 && rows.length <= 8 ? button("Compare", () => act.compare()) : "",
-      h("button", { class: "export", hidden: !act.canExport(), onclick: () => act.export() }, "Export…"),
+      button("Export…", () => act.export()),
       h("button", { class: "danger", title: "Del", onclick: () => act.remove() }, "Delete"),
       h("button", { class: "clear", onclick: () => act.clear() }, "Clear"));
   }
