@@ -63,8 +63,8 @@ async function follow(now) {
   const bar = h("progress", { max: 1 });
   const words = h("span", { class: "dim" });
   const cancel = h("button", { onclick: () => attempt(() => api.post(`/jobs/${id}/cancel`)) }, "Cancel");
-  const card = h("div", { class: "job" }, h("b", {}, now.job.title), h("div", { class: "line" }, bar, cancel), words);
-  document.getElementById("jobs").append(card);
+  const card = h("div", {}, h("b", {}, now.job.title), h("div", { class: "line" }, bar, cancel), words);
+  document.getElementById("running").append(card);
   while (isRunning(now)) {
     show(now, bar, words);
     await new Promise((resolve) => { setTimeout(resolve, LOOK); });

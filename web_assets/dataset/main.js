@@ -401,7 +401,8 @@ rows.query = { sort: start.sort, descending: start.descending };
 document.body.classList.toggle("embedded", start.isEmbedded);
 document.getElementById("top").append(
   h("b", {}, "Comp-ACT Studio"),
-  h("nav", {}, h("a", { href: "/", target: "_top" }, "Drive"), h("a", { href: "/dataset", class: "here" }, "Dataset")),
+  h("nav", {}, h("a", { href: "/", target: "_top" }, "Drive"), h("a", { href: "/dataset", class: "here" }, "Dataset"),
+    h("a", { href: "/train?view=train" }, "Train"), h("a", { href: "/train?view=evaluate" }, "Evaluate")),
 );
 attempt(async () => {
   await load({ toTop: true });
