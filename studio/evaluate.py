@@ -33,11 +33,11 @@ from studio.recorder import new_episode_id, versions
 from studio.references import REFERENCES
 from studio.session import CONTROL_PERIOD, Agent
 from studio.station import CONTACT, Station, Take
+from studio.tasks import HELD_SUCCESS
 from studio.twin import Twin
 
 _MakeAgent = Callable[[Twin], Agent]
 
-HELD_SUCCESS = 0.5  # [s] for which success must hold to end a rollout
 CURVE_EVERY = 5  # ticks between two points of a curve: 20 Hz
 
 

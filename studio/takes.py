@@ -11,9 +11,8 @@ from studio.episode import Header, Outcome
 from studio.messages import Driver, Judgement, NoticeKind, Phase, TakeStatus
 from studio.recorder import Recorder, Take
 from studio.session import CONTROL_PERIOD, Subscriber
-from studio.tasks import Progress
+from studio.tasks import HELD_SUCCESS, Progress
 
-HELD_SUCCESS = 0.5  # [s] for which success must hold before collecting ends a take
 BETWEEN_TAKES = 1.5  # [s] that a kept take is shown before the next reset, while collecting
 
 

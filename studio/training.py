@@ -231,8 +231,9 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _commit() -> dict[str, str]:
-    """Which code, where this is a checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    """Which code, where this is a checkout, which is only looked at: its index is not refreshed."""
+    command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent)]
+    command += ["describe", "--always", "--dirty", "--abbrev=12"]
     with suppress(OSError, subprocess.SubprocessError):
         told = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=True)
         return {"commit": told.stdout.strip()}

@@ -5,15 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import resource
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
-from test_training import QUICK
+from test_training import QUICK, run_studio
 from visitor import wait_for
 
 from studio import runs
@@ -265,3 +268,86 @@ def test_curves_follow_a_run_that_is_resumed_and_damaged(tmp_path: Path) -> None
     with path.open("a") as file:
         file.write(told(range(51, 60)))
     assert reader.read(tmp_path).curves["loss"].step[-1] == 59
+
+
+SUBMIT = """
+import sys, time
+from studio import Studio
+from studio.jobs import plans
+studio = Studio(sys.argv[1])
+ann = plans.Where(author="ann", threads=1)
+studio.submit(plans.demo(studio.catalog, ann, "wiping", episodes=2, cameras=False))
+studio.submit(plans.export(studio.catalog, ann, "out", "act-hdf5", filters={"task": "wiping"}))
+with studio.jobs.kept_going():
+    print("here", flush=True)
+    time.sleep(100)
+"""
+
+
+def test_jobs_go_on_when_the_server_is_killed(studio: Studio) -> None:
+    server = subprocess.Popen(
+        [sys.executable, "-c", SUBMIT, str(studio.data_dir)], stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert server.stdout is not None
+    server.stdout.readline()
+    os.killpg(server.pid, signal.SIGKILL)
+    server.wait()
+    server.stdout.close()
+    second, first = studio.jobs.all()
+    assert (first.standing.state, second.standing.state) == ("running", "queued")
+    assert over(studio, first.job.job_id).standing.state == "done"
+    assert over(studio, second.job.job_id).standing.state == "done"
+    assert len(studio.episodes(task="wiping")) == 4
+
+
+def test_a_disk_that_is_full_fails_the_job_with_its_reason(studio: Studio) -> None:
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # a checkpoint is larger
+
+    command = [
+        sys.executable,
+        "-m",
+        "studio",
+        "jobs",
+        "submit",
+        "--data",
+        str(studio.data_dir),
+        "--json",
+        "--",
+    ]
+    settings = ["--no-images", "--width", "16", "--heads", "2", "--steps", "3", "--name", "learner"]
+    told = subprocess.run(
+        [*command, "train", "wiping", *settings], preexec_fn=small_files, stdout=subprocess.PIPE, check=True
+    )
+    job_id = json.loads(told.stdout)["job"]["job_id"]
+    ended = over(studio, job_id)
+    assert (ended.standing.state, ended.standing.exit_code) == ("failed", 1)
+    assert "File too large" in ended.standing.why
+    assert runs.load(studio.data_dir, "learner").checkpoints == ()  # nor half of one
+
+
+def test_the_command_line_tells_what_there_is(studio: Studio, capsys: pytest.CaptureFixture[str]) -> None:
+    data = ("--data", str(studio.data_dir))
+
+    def told(*arguments: str) -> Any:
+        assert run_studio("jobs", *arguments, *data, "--json") == 0
+        return json.loads(capsys.readouterr().out)
+
+    studio.jobs.slots = 0
+    assert told("list") == []
+    command = ("evaluate", "nothing", "--task", "wiping", "--episodes", "2", "--seed", "5")
+    assert run_studio("jobs", "submit", *data, "--sweep", "seed=5,7", "--", *command[:-2]) == 0
+    capsys.readouterr()
+    found = told("list")
+    assert [now["job"]["settings"]["seed"] for now in found] == [7, 5]
+    job_id = found[0]["job"]["job_id"]
+    assert told("show", job_id)["standing"]["state"] == "queued"
+    assert told("cancel", job_id)["standing"]["state"] == "cancelled"
+    assert told("resume", job_id)["standing"]["state"] == "queued"
+    assert run_studio("jobs", "delete", job_id, *data) == 0
+    capsys.readouterr()
+    assert [job["job_id"] for job in told("list", "--trash")] == [job_id]
+    assert told("restore", job_id)["job"]["job_id"] == job_id
+    assert told("slots", "0") == {"slots": 0}
+    for bad in (("submit", "--", "dance"), ("cancel", "x"), ("submit", "--", "train", "drawing")):
+        assert run_studio("jobs", bad[0], *data, *bad[1:]) == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -16,6 +17,7 @@ from policy.config import TrainConfig
 from studio import training
 from studio.__main__ import main
 from studio.api import DemoReport, Studio
+from studio.benchmarks.episodes import made_up_header, write_take
 from studio.index import Filters
 from studio.inputs.policy import Immediate, PolicyAgent
 from studio.session import Session
@@ -92,6 +94,17 @@ def test_a_rollout_is_no_demonstration(data: Path) -> None:
         assert studio.begin_run("wiping", QUICK, "b", filters=asked).takes == (
             Chosen(rollout.episode_id, None, 1),
         )
+
+
+def test_what_a_policy_drove_on_the_page_is_no_demonstration(tmp_path: Path) -> None:
+    with Studio(tmp_path) as studio:
+        for agent, provenance in {"operator": {}, "learner": {"run": "learner"}, "imported": {}}.items():
+            header = dataclasses.replace(made_up_header(), agent=agent, provenance=provenance)
+            write_take(tmp_path / "episodes" / "made-up" / f"{header.episode_id}.mcap", header, 0.1)
+        found = training.choose(studio.catalog, "made-up", filters={"outcome": "unmarked"})
+        assert {row.agent for row in found} == {"operator", "imported"}
+        asked: Filters = {"outcome": "unmarked", "agent": "learner"}
+        assert [row.agent for row in training.choose(studio.catalog, "made-up", filters=asked)] == ["learner"]
 
 
 def test_only_what_is_asked_for_is_learned_from(data: Path) -> None:

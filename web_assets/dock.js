@@ -15,7 +15,7 @@
   const NARROWEST = 420; // [px] of the page and of what is left beside it
   const here = () => document.querySelector(".here")?.dataset;
 
-  function open(path) {
+  function open(path, title) {
     close();
     const key = here()?.view;
     const episode = here()?.episode || new URLSearchParams(location.search).get("episode");
@@ -24,7 +24,7 @@
     dock.id = "studio-dock";
     const frame = document.createElement("iframe");
     frame.src = `${path}?${query}`;
-    frame.title = "Dataset";
+    frame.title = title;
     const grip = document.createElement("div");
     grip.className = "grip";
     grip.addEventListener("pointerdown", (event) => resize(event, dock, grip));
@@ -94,6 +94,6 @@
 
   addEventListener("click", (event) => {
     const button = event.target.closest?.("[data-dock]");
-    if (button) open(button.dataset.dock);
+    if (button) open(button.dataset.dock, button.textContent);
   }, true);
 })();

@@ -28,6 +28,7 @@ PARTS = (
     "view",
     "page",
     "policy",
+    "jobs",
 )
 
 Results = dict[str, Any]  # what a part measured
@@ -110,6 +111,7 @@ GOALS = (
     Goal("catalog", "the same right after an edit [ms]", lambda r: r["search_ms_after_edit"], "<=", 30.0),
     Goal("catalog", "slowest facets of 100,000 takes, CPU [ms]", lambda r: r["facets_ms"], "<=", 100.0),
     Goal("catalog", "the same right after an edit [ms]", lambda r: r["facets_ms_after_edit"], "<=", 100.0),
+    Goal("catalog", "slowest sums of 100,000 takes [ms]", lambda r: r["amount_ms_after_edit"], "<=", 100.0),
     Goal("catalog", "index of 1,000 takes built anew, CPU [s]", lambda r: r["rebuild_s"], "<=", 20.0),
     Goal("export", "60 s of three cameras to LeRobot, CPU [s]", lambda r: r["lerobot_cpu_s"], "<=", 20.0),
     Goal("live", "ticks more than 2 ms late, share", lambda r: r["late_share"], "<=", 0.005),
@@ -140,4 +142,7 @@ GOALS = (
     Goal("policy", "small, peak memory of training [GB]", lambda r: r["small_peak_GB"], "<=", 4.0),
     Goal("policy", "paper at 240x320, step at batch 8 [s]", lambda r: r["paper_step_s"], "<=", 7.0),
     Goal("policy", "the same, one decoder layer [s]", lambda r: r["shallow_step_s"], "<=", 3.9),
+    Goal("jobs", "asked for training to its first step [s]", lambda r: r["first_step_s"], "<=", 15.0),
+    Goal("jobs", "a page that lists ten, share of a core", lambda r: r["refresh_share_of_core"], "<=", 0.03),
+    Goal("jobs", "late ticks while all cores train, share", lambda r: r["late_share"], "<=", 0.02),
 )

@@ -19,6 +19,8 @@ import numpy as np
 from controller.stiffness import StiffnessTable
 from controller.types import Action, Array, Pose, StiffnessMode, quaternion_from_rotation_vector
 
+HELD_SUCCESS = 0.5  # [s] for which success must hold to end a rollout, or a take while collecting
+
 
 @dataclass(frozen=True, slots=True)
 class Grasp:

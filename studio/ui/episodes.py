@@ -28,6 +28,8 @@ from studio.ui.viser_private import run_javascript
 DATASET_PAGE = (
     '<div class="dock-row"><button data-dock="/dataset">Dataset page</button>'
     '<a href="/dataset" target="_blank" rel="noopener">in a tab of its own</a></div>'
+    '<div class="dock-row"><button data-dock="/train">Train, evaluate</button>'
+    '<a href="/train" target="_blank" rel="noopener">in a tab of its own</a></div>'
 )
 
 

@@ -127,7 +127,7 @@ def test_a_run_is_duplicated_compared_deleted_and_restored(site: Site, page: Pag
 
 def test_two_agents_are_compared_on_the_same_scenes(site: Site, page: Page) -> None:
     one = site.studio.evaluation("learner").evaluation_id
-    page.goto(f"{site.front.url}/train?view=evaluate")
+    page.goto(f"{site.front.url}/train?tab=evaluate")
     form, closer = page.locator("#ask"), page.locator("#closer")
     form.get_by_label("Run or reference").select_option("demonstrator")
     form.get_by_label("Task").select_option("wiping")

@@ -75,26 +75,25 @@ export class JobList {
   runsOf(runs, jobs, chosen) {
     if (!runs.length) return [];
     return [h("div", { class: "title" }, h("h2", {}, "Runs"), h("small", { class: "dim" }, "tick several to compare their curves")),
-      h("table", {}, h("thead", {}, h("tr", {}, ["", "Run", "Step", "Takes", "Best on others"].map((text) => h("th", {}, text)))),
+      h("table", {}, h("thead", {}, h("tr", {}, ["", "Run", "Step", "Loss on others"].map((text) => h("th", {}, text)))),
         h("tbody", {}, runs.map((run) => h("tr", { class: chosen.runs.includes(run.name) ? "here" : "" },
           h("td", {}, h("input", { type: "checkbox", "data-key": `tick ${run.name}`, "aria-label": `Compare ${run.name}`, checked: chosen.runs.includes(run.name), onchange: () => this.act.openRun(run.name, true) })),
-          h("td", {}, h("button", { class: "link", "data-key": `run ${run.name}`, title: run.problem, onclick: () => this.act.openRun(run.name, false) }, run.name), run.problem && h("span", { class: "why" }, " ▲")),
+          h("td", {}, h("button", { class: "link", "data-key": `run ${run.name}`, title: run.problem, onclick: () => this.act.openRun(run.name, false) }, run.name), run.problem && h("span", { class: "why" }, " ▲"),
+            h("small", { class: "dim" }, `${run.task}, ${run.takes.length} takes`)),
           h("td", { class: "number" }, `${run.step} / ${run.steps}`),
-          h("td", { class: "number" }, String(run.takes.length)),
           h("td", { class: "number" }, run.best === null ? "–" : run.best.toFixed(4))))))];
   }
 
   evaluationsOf(evaluations, chosen) {
     if (!evaluations.length) return [];
     return [h("div", { class: "title" }, h("h2", {}, "Evaluations")),
-      h("table", {}, h("thead", {}, h("tr", {}, ["Agent", "Task", "Success", "95 %", "Force", ""].map((text) => h("th", {}, text)))),
+      h("table", {}, h("thead", {}, h("tr", {}, ["Agent", "Success", "95 %", "Force"].map((text) => h("th", {}, text)))),
         h("tbody", {}, evaluations.map((told) => h("tr", { class: chosen.evaluation === told.evaluation ? "here" : "" },
-          h("td", {}, h("button", { class: "link", "data-key": told.evaluation, onclick: () => this.act.openEvaluation(told.evaluation) }, told.label), told.step ? h("small", { class: "dim" }, ` step ${told.step}`) : ""),
-          h("td", {}, told.task),
+          h("td", {}, h("button", { class: "link", "data-key": told.evaluation, onclick: () => this.act.openEvaluation(told.evaluation) }, told.label),
+            h("small", { class: "dim" }, [told.task, told.step && `step ${told.step}`, date(told.started)].filter(Boolean).join(", "))),
           h("td", { class: "number" }, `${told.successes} / ${told.episodes}`),
           h("td", { class: "number" }, interval(told.wilson_95)),
-          h("td", { class: "number" }, `${told.force_mean_N.toFixed(1)} N`),
-          h("td", { class: "dim" }, date(told.started))))))];
+          h("td", { class: "number" }, `${told.force_mean_N.toFixed(1)} N`)))))];
   }
 }
 

@@ -1,6 +1,6 @@
 // The page of jobs: train and evaluate, what runs, and what came of it.
 //
-// /train?view=evaluate&job=ID&run=NAME&run=NAME&evaluation=ID&against=ID  shows the same again.
+// /train?tab=evaluate&job=ID&run=NAME&run=NAME&evaluation=ID&against=ID  shows the same again.
 
 import { api } from "../dataset/api.js";
 import { attempt, h } from "../dataset/dom.js";
@@ -48,8 +48,8 @@ function again(job) {
 function go(changes) {
   Object.assign(page, changes);
   const told = new URLSearchParams(location.search);
-  for (const name of ["view", "job", "run", "evaluation", "against"]) told.delete(name);
-  if (page.view !== "train") told.set("view", page.view);
+  for (const name of ["tab", "job", "run", "evaluation", "against"]) told.delete(name);
+  if (page.view !== "train") told.set("tab", page.view);
   for (const name of ["job", "evaluation", "against"]) if (page[name]) told.set(name, page[name]);
   for (const name of page.runs) told.append("run", name);
   const text = told.toString();
@@ -103,7 +103,7 @@ at("top").append(
   h("nav", {},
     h("a", { href: "/", target: "_top" }, "Drive"),
     h("a", { href: "/dataset" }, "Dataset"),
-    Object.entries(VIEWS).map(([view, label]) => h("a", { href: `/train?view=${view}`, "data-view": view, onclick: (event) => { event.preventDefault(); go({ view }); } }, label))),
+    Object.entries(VIEWS).map(([view, label]) => h("a", { href: `/train?tab=${view}`, "data-view": view, onclick: (event) => { event.preventDefault(); go({ view }); } }, label))),
   h("span", { class: "silence" }, "The studio does not answer; jobs go on by themselves."),
   h("span", { class: "note" }, "Jobs run behind everything else on this machine, and leave one core to the live session."),
 );
@@ -111,7 +111,7 @@ at("top").append(
 const given = new URLSearchParams(location.search);
 document.body.classList.toggle("embedded", given.has("embed"));
 go({
-  view: given.get("view") in VIEWS ? given.get("view") : "train",
+  view: given.get("tab") in VIEWS ? given.get("tab") : "train",
   job: given.get("job"),
   runs: given.getAll("run"),
   evaluation: given.get("evaluation"),
