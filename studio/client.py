@@ -265,6 +265,10 @@ class Client:
     def health_of(self, episode_id: str) -> Health:
         return self._get(f"{_take(episode_id)}/health", Health)
 
+    def name(self) -> str:
+        """Under which the studio knows this program; empty without a session."""
+        return self._get("/me", dict[str, str])["name"]
+
     # The live session
 
     def status(self) -> dict[str, Any]:

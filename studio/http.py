@@ -167,6 +167,11 @@ def _session_router(remote: Remote, lease: Lease) -> APIRouter:
         """
         return EventStream(remote, streams, person_of(request), name, rate)
 
+    @router.get("/me", response_model=dict[str, str])
+    def tell_me(request: Request) -> Response:
+        """Under which `name` the studio knows who asks; empty where nobody gave one."""
+        return as_json({"name": lease.name_of(person_of(request))})
+
     @router.post("/session/control")
     def control(request: Request, body: ControlIn) -> Response:
         """Take control or ask for it, give it up, or keep it although somebody asks."""

@@ -82,6 +82,11 @@ class Lease:
         with self._lock:
             return self._words(self._holder)
 
+    def name_of(self, person: PersonId) -> str:
+        """As this person typed it, or as the studio knew; empty where neither."""
+        with self._lock:
+            return self._names.get(person, "")
+
     def sit(self, person: PersonId, kind: str = "guest", name: str = "") -> Seat:
         """A connection of this person, until it leaves. `kind` and a number name who gives no `name`."""
         with self._lock:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from test_catalog import record as record_forces
 from test_http import Site, record
+from visitor import wait_for
 
 from studio.__main__ import main
 from studio.client import Client, Refused
@@ -109,6 +110,12 @@ def test_grades_are_known_of_those_that_were_examined(client: Client, ids: list[
     assert graded.findings
     assert client._post("/dataset-health", dict, {"episode_ids": ids[:2]})["unexamined"] == 0
     assert client.grades(*ids).keys() == set(ids[:2])
+
+
+def test_a_person_is_known_by_the_name_of_their_session(client: Client) -> None:
+    assert client.name() == ""
+    with client.session("Ana"):
+        assert wait_for(client.name) == "Ana"
 
 
 def studio(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

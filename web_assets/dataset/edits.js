@@ -7,6 +7,7 @@ const NAME = "studio.author";
 
 // {outcome: "success"} of one take or many, signed; `done` hears the rows that came of it.
 export class Edits {
+  known = ""; // the name under which the studio knows this person
   #api; #done;
   #undoable = []; // {words, undo}, the oldest first
   #last = Promise.resolve(); // one after the other: who undoes at once means what was just asked for
@@ -15,7 +16,7 @@ export class Edits {
     [this.#api, this.#done] = [api, done];
   }
 
-  get author() { return localStorage.getItem(NAME) || "guest"; }
+  get author() { return localStorage.getItem(NAME) || this.known || "guest"; }
   set author(name) { localStorage.setItem(NAME, name.trim()); }
 
   // What the next undo takes back, in words; null where there is nothing.

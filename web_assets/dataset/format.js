@@ -31,6 +31,13 @@ export function date(s) {
   return then.getFullYear() === new Date().getFullYear() ? `${day} ${time}` : `${day} ${then.getFullYear()}`;
 }
 
+// The time of day where it was within a day, else the day.
+export function shortDate(s) {
+  const then = new Date(1e3 * s);
+  const isRecent = Date.now() - then < DAY;
+  return isRecent ? then.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" }) : then.toLocaleDateString("en-GB", { day: "numeric", month: "short" });
+}
+
 export const exactDate = (s) => new Date(1e3 * s).toLocaleString("en-GB");
 
 export const name = (row) => (row.seed === null ? row.task : `${row.task} · ${row.seed}`);

@@ -408,6 +408,8 @@ attempt(async () => {
   await load({ toTop: true });
   if (start.episode) await openById(start.episode);
   table.focus();
+  edits.known = (await api.get("/me")).name;
+  toolbar.author = edits.author;
   exports.followAll().catch(() => {});
   api.post("/refresh").catch(() => {}); // takes that were copied into the folder; `look` hears of them
   for (;;) {

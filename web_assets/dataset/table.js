@@ -7,7 +7,7 @@ import * as format from "./format.js";
 const HEIGHT = 54; // [px] of a row, as in dataset.css
 const SPARE = 6; // rows beyond either edge
 const REST = 120; // [ms] of scrolling less before pictures are fetched
-const AT_ONCE = 3; // pictures
+const AT_ONCE = 4; // pictures
 
 // [class, heading, what it is sorted by]
 const COLUMNS = [
@@ -209,7 +209,7 @@ export class Table {
       case "task":
         return [h("b", { title: row.episode_id }, format.name(row)),
           h("small", { class: row.note ? "note" : "instruction", title: row.note || row.instruction }, row.note || row.instruction),
-          h("small", { class: "brief" }, `${format.seconds(row.duration)} · ${row.peak_force.toFixed(1)} N · ${format.date(row.started)}`)];
+          h("small", { class: "brief" }, `${format.seconds(row.duration)} · ${row.peak_force.toFixed(1)} N · ${format.shortDate(row.started)}`)];
       case "operator": return [h("span", { title: row.operator }, row.operator), h("small", {}, row.agent)];
       case "length": return format.seconds(row.duration);
       case "outcome": return format.outcome(row.outcome);
