@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Annotated, Any, Literal
 
 import msgspec
-from fastapi import APIRouter, Header, Query
+from fastapi import APIRouter, Header, HTTPException, Query
 from fastapi import Path as InPath
 from pydantic import Field
 from starlette.responses import Response
@@ -209,6 +210,18 @@ def config_of(preset: Literal["small", "paper"], changes: dict[str, Any]) -> Tra
     return msgspec.convert({**fields, **changes, "preset": preset}, TrainConfig)
 
 
+@contextmanager
+def written() -> Iterator[None]:
+    """As `refusals`, around what writes: a disk that is full is told, too."""
+    with refusals():
+        try:
+            yield
+        except (FileExistsError, FileNotFoundError):
+            raise
+        except OSError as error:
+            raise HTTPException(507, f"It cannot be written: {error.strerror}.") from error
+
+
 def jobs_router(studio: Studio) -> APIRouter:
     router, jobs = APIRouter(responses=REFUSED, tags=["jobs"]), studio.jobs
 
@@ -228,13 +241,13 @@ def jobs_router(studio: Studio) -> APIRouter:
     @router.post("/jobs", response_model=JobNow, status_code=201)
     def submit(body: JobIn) -> Response:
         """Put a job at the end of the queue; it may start at once. What cannot work is refused here."""
-        with refusals():
+        with written():
             return as_json(studio.submit(body.request(studio, body.where())), 201)
 
     @router.post("/sweeps", response_model=list[JobNow], status_code=201)
     def submit_sweep(body: SweepIn) -> Response:
         """A job for each combination of some values; all of them are checked before the first is queued."""
-        with refusals():
+        with written():
             return as_json([studio.submit(request) for request in body.requests(studio)], 201)
 
     @router.get("/jobs/{job_id}", response_model=JobNow)

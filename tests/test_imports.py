@@ -38,13 +38,13 @@ LAYERS = (
     ("episode", "episode_writer", "recovery", "tasks", "session"),
     ("twin", "cameras", "inputs", "policy_link"),
     (
-        *("recorder", "catalog", "replay", "training", "jobs", "export", "pilot"),
+        *("recorder", "catalog", "replay", "training", "runs", "jobs", "export", "pilot"),
         *("references", "evaluation", "evaluate", "report", "probes", "health", "survey", "collections"),
     ),
     ("api",),
     (
         *("server", "site", "headset", "http", "http_takes", "http_wire", "reading", "ui", "serve"),
-        *("http_jobs", "commands", "client", "__main__"),
+        *("http_jobs", "http_runs", "commands", "client", "client_jobs", "__main__"),
     ),
 )
 SKINS = len(LAYERS) - 1

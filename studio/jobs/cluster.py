@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import sys
 import uuid
+from importlib.util import find_spec
 from pathlib import Path
+from shlex import join
 from typing import TYPE_CHECKING
 
 from studio.jobs.job import CANCEL, LOG, Job, Standing
@@ -27,8 +29,6 @@ class RayRunner:
 
     def submit(self, job: Job, folder: Path) -> str:
         """Raises RuntimeError where the cluster does not answer or does not want it."""
-        from shlex import join
-
         keeper = [sys.executable, "-m", "studio.jobs.keeper", str(folder), "--stay"]
         try:
             return str(
@@ -44,6 +44,8 @@ class RayRunner:
 
     def status(self, job: Job, folder: Path, standing: Standing) -> Found:
         """lost: the head does not answer. One that it does not know, since it began anew, is ended."""
+        if find_spec("ray") is None:
+            return "lost"
         try:
             told = str(self._client().get_job_status(standing.handle).value)
         except _no_answer():
@@ -81,7 +83,9 @@ class RayRunner:
 
 def _no_answer() -> tuple[type[Exception], ...]:
     """What Ray's client raises where nobody listens."""
-    from requests import ConnectionError as NoConnection
-    from requests import Timeout
-
+    try:
+        from requests import ConnectionError as NoConnection
+        from requests import Timeout
+    except ModuleNotFoundError:  # then there is no Ray either
+        return (ConnectionError,)
     return (ConnectionError, NoConnection, Timeout)

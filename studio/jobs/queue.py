@@ -159,12 +159,13 @@ class Jobs:
             now, folder = self.get(job_id), self.folder(job_id)
             if now.standing.is_over:
                 raise JobBusyError(f"{now.job.title} is {now.standing.state} already.")
-            if now.standing.state == "queued":
-                if now.standing.handle:
+            if now.standing.state != "queued" or now.standing.handle:
+                try:
                     runner_of(now.job).cancel(now.job, folder, now.standing)
+                except RuntimeError as error:
+                    raise JobBusyError(str(error)) from error
+            if now.standing.state == "queued":
                 self._write(folder, now.standing, state="cancelled", why="Cancelled before it began.")
-            else:
-                runner_of(now.job).cancel(now.job, folder, now.standing)
         return self.get(job_id)
 
     def resume(self, job_id: str) -> JobNow:
@@ -190,6 +191,8 @@ class Jobs:
             now = self.get(job_id)
             if now.standing.state in ("running", "lost"):
                 raise JobBusyError(f"{now.job.title} is {now.standing.state}; cancel it first.")
+            if now.job.kind == "train" and (users := self._who_evaluate(now.job.subject)):
+                raise JobBusyError(f"{users[0].job.title} is {users[0].standing.state}; cancel that first.")
             for source, target in self._places(now.job):
                 if source.exists():
                     target.parent.mkdir(parents=True, exist_ok=True)
@@ -271,6 +274,9 @@ class Jobs:
             state = "cancelled" if (folder / CANCEL).exists() else "interrupted"
             why = "It is gone, without having said why: perhaps the machine was switched off."
             self._write(folder, standing, state=state, why=why, ended=time.time())
+        elif found == "lost" and _was_given_up(folder, job):
+            why = f"Cancelled while {job.runner} did not answer; it may go on there."
+            self._write(folder, standing, state="cancelled", why=why, ended=time.time())
         elif found == "lost" and standing.state != "lost":
             self._write(folder, standing, state="lost", why=f"{job.runner} does not answer.")
         elif found in ("running", "waiting") and standing.state == "lost":
@@ -312,6 +318,11 @@ class Jobs:
         same = (now for now in self.all() if (now.job.kind, now.job.subject) == (job.kind, job.subject))
         return next((n for n in same if not n.standing.is_over and n.job.job_id != job.job_id), None)
 
+    def _who_evaluate(self, run: str) -> list[JobNow]:
+        """Jobs that are not over and need the run."""
+        asked = (now for now in self.all() if (now.job.kind, now.job.subject) == ("evaluate", run))
+        return [now for now in asked if not now.standing.is_over]
+
     def _n_running(self) -> int:
         return sum(now.job.runner == "local" and now.standing.state == "running" for now in self.all())
 
@@ -339,6 +350,13 @@ class Jobs:
         with (self._folder / ".lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
+
+
+def _was_given_up(folder: Path, job: Job) -> bool:
+    """Whether somebody cancelled it so long ago that a keeper that lives would have said something."""
+    with suppress(FileNotFoundError):
+        return time.time() - (folder / CANCEL).stat().st_mtime > 2 * job.grace
+    return False
 
 
 def runner_of(job: Job) -> JobRunner:

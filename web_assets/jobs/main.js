@@ -109,9 +109,10 @@ at("top").append(
 );
 
 const given = new URLSearchParams(location.search);
+const tab = given.get("tab") ?? given.get("view"); // a view inside the studio's page is another thing
 document.body.classList.toggle("embedded", given.has("embed"));
 go({
-  view: given.get("tab") in VIEWS ? given.get("tab") : "train",
+  view: tab in VIEWS ? tab : "train",
   job: given.get("job"),
   runs: given.getAll("run"),
   evaluation: given.get("evaluation"),
