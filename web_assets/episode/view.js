@@ -124,7 +124,8 @@ export class EpisodeView {
       this.api.get(`${path(take)}/timeline`), this.api.get(`${path(take)}/curves`, { points: POINTS }),
     ]);
     Object.assign(take, { timeline, curves, whole: curves });
-    this.cameras.setTimes(this.takes.indexOf(take), timeline.images);
+    const place = this.takes.indexOf(take); // -1 where another take was opened, or none, meanwhile
+    if (place >= 0) this.cameras.setTimes(place, timeline.images);
   }
 
   // What people say about the one take: trim and segments.
