@@ -225,6 +225,26 @@ def test_an_edited_take_stays_under_the_cursor_until_one_goes_on(
     wait_for(untouched)
 
 
+def test_leafing_quickly_ends_at_the_take_under_the_cursor(
+    page: Page, site: Site, untouched: Callable[[], bool]
+) -> None:
+    visit(page, site)
+    page.keyboard.press("Enter")
+    for key in ("ArrowDown", "ArrowDown", "ArrowUp", "ArrowDown"):
+        page.keyboard.press(key)
+    page.keyboard.press("4")  # is about the take under the cursor, shown already or not
+    expect(page.locator("#episode")).to_have_attribute("data-drawn", site.take(3).episode_id)
+    wait_for(lambda: site.take(3).quality == 4)
+    assert site.take(3).episode_id in page.url
+    expect(page.locator(".toast.bad")).to_have_count(0)
+    page.keyboard.press("u")
+    wait_for(untouched)
+    page.keyboard.press("Escape")
+    expect(page.locator("#episode")).to_be_hidden()
+    page.go_back()
+    expect(page.locator("#episode")).to_be_visible()
+
+
 def test_a_selection_becomes_a_collection_that_stays_as_it_is(
     page: Page, site: Site, untouched: Callable[[], bool]
 ) -> None:

@@ -15,6 +15,7 @@ import { Table } from "./table.js";
 import { Toolbar } from "./toolbar.js";
 
 const LOOK = 1500; // [ms] between looks whether anything has changed
+const HURRY = 120; // [ms] in which who leafs through takes goes on to the next
 const MOST_SELECTED = 5000; // beyond that the command line is the better tool
 
 const section = document.getElementById("episode");
@@ -25,7 +26,9 @@ const rows = new Rows(api, () => table.follow());
 const table = new Table(document.getElementById("takes"), rows);
 const edits = new Edits(api, changed);
 let view = null; // of the open take, once one was opened
+let loading = null; // promise of it
 let revision = null; // what the studio had when we asked last
+let opening = 0; // timer
 let isLooking = false;
 let isSettling = false; // the take under the cursor was edited: the list waits until the cursor leaves it
 
@@ -147,7 +150,7 @@ function changed(told, isElsewhere) {
   table.patch(told);
   if (view && state.episode) {
     const row = told.find(({ episode_id: id }) => id === state.episode);
-    if (row) view.open(shown = row); // it keeps its time
+    if (row) open(row, { isStep: false }); // it keeps its time
   }
 }
 
@@ -288,15 +291,16 @@ function deleteCollection(name) {
 
 // One take in view
 
-async function theView() {
-  if (!view) {
-    const { EpisodeView } = await import("../episode/view.js");
+// One view for all takes, made when the first is opened.
+function theView() {
+  loading ??= import("../episode/view.js").then(({ EpisodeView }) => {
     view = new EpisodeView(section, {
       api, changed: editedInView, selected: () => [...table.selected.values()],
       author: () => edits.author, close: () => close(),
     });
-  }
-  return view;
+    return view;
+  });
+  return loading;
 }
 
 // An edit that the view itself made: it is this person's newest, which is what the studio takes back.
@@ -306,14 +310,17 @@ function editedInView(row) {
   changed([row], false);
 }
 
-function open(row, { isStep = true } = {}) {
+// `isStep`: the browser's way back leads to what was shown before. `delay` [ms] until it is read.
+function open(row, { isStep = true, delay = 0 } = {}) {
   if (state.source.kind === "trash") return toast("A deleted take is not opened; restore it first (R).");
   section.hidden = false;
   document.body.classList.add("viewing");
   shown = row;
   state.episode = table.openId = row.episode_id;
   remember(isStep);
-  return attempt(async () => (await theView()).open(row));
+  clearTimeout(opening);
+  opening = setTimeout(() => attempt(async () => (await theView()).open(row)), delay);
+  return undefined;
 }
 
 async function openById(id) {
@@ -326,6 +333,7 @@ async function openById(id) {
 }
 
 function close({ isStep = true } = {}) {
+  clearTimeout(opening);
   section.hidden = true;
   document.body.classList.remove("viewing");
   state.episode = table.openId = shown = null;
@@ -369,7 +377,7 @@ table.onOpen = (row) => row && open(row);
 table.onSort = sort;
 table.onSelect = () => toolbar.showSelection([...table.selected.values()]);
 table.onMove = () => {
-  if (state.episode && table.row) open(table.row, { isStep: false });
+  if (state.episode && table.row) open(table.row, { isStep: false, delay: HURRY });
   if (isSettling) settle();
 };
 

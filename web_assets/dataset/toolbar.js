@@ -25,7 +25,7 @@ export class Toolbar {
     this.#selection = h("div", { class: "selection", hidden: true });
     this.#banner = h("div", { class: "banner", hidden: true });
     container.append(
-      h("div", { class: "tools" },
+      h("div", { class: "tools" }, this.#selection,
         this.#search, this.#chips, this.#amount,
         h("span", { class: "buttons" },
           h("button", { onclick: () => act.health() }, "Health…"),
@@ -33,7 +33,7 @@ export class Toolbar {
           h("button", { class: "export", onclick: () => act.export() }, "Export…"),
           this.#author,
           h("button", { class: "help", title: "Keys (?)", "aria-label": "Keys", onclick: () => act.help() }, "?"))),
-      this.#banner, this.#selection);
+      this.#banner);
   }
 
   set author(name) { this.#author.textContent = name; }
