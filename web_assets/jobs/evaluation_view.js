@@ -3,7 +3,7 @@
 import { api } from "../dataset/api.js";
 import { attempt, h } from "../dataset/dom.js";
 import { date } from "../dataset/format.js";
-import { select } from "./fields.js";
+import { link, select } from "./fields.js";
 import { interval, progressOf } from "./job_list.js";
 
 export class EvaluationView {
@@ -74,14 +74,14 @@ export class EvaluationView {
 function provenance(summary, evaluation) {
   const seeds = summary.seeds;
   return h("span", {},
-    summary.step ? [h("a", { href: `/train?run=${encodeURIComponent(summary.run)}` }, `run ${summary.run}`), ` at step ${summary.step}, ${summary.execution}`] : `reference ${summary.run}`,
+    summary.step ? [h("a", { href: link("/train", { run: summary.run }) }, `run ${summary.run}`), ` at step ${summary.step}, ${summary.execution}`] : `reference ${summary.run}`,
     `, seeds ${Math.min(...seeds)} to ${Math.max(...seeds)}, studio ${evaluation.versions.studio ?? "?"}, ${date(evaluation.started)}`,
     summary.hidden?.length ? `, hidden: ${summary.hidden.join(", ")}` : "");
 }
 
 const cards = (told) => h("div", { class: "cards" }, Object.entries(told).map(([name, [value, more]]) => h("div", { class: "card" }, h("small", {}, name), h("b", {}, value), h("small", { class: "dim" }, more))));
 
-const episode = (rollout) => (rollout.episode_id ? h("a", { href: `/dataset?episode=${encodeURIComponent(rollout.episode_id)}` }, "open") : "");
+const episode = (rollout) => (rollout.episode_id ? h("a", { href: link("/dataset", { episode: rollout.episode_id }) }, "open") : "");
 
 const outcome = (rollout) => (rollout.error ? h("span", { class: "outcome unmarked", title: rollout.error }, "! error") : h("span", { class: `outcome ${rollout.success ? "success" : "failure"}` }, h("b", {}, rollout.success ? "✓" : "✗"), rollout.success ? " success" : " failure"));
 

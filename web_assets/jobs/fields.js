@@ -58,6 +58,14 @@ export function numberOf(label, text) {
   return value;
 }
 
+// The address of another page of ours; beside the 3-D view it stays beside it.
+export function link(path, query = {}) {
+  const given = new URLSearchParams(location.search), told = new URLSearchParams(query);
+  if (given.has("embed")) for (const name of ["embed", "view"]) if (given.has(name)) told.set(name, given.get(name));
+  const text = told.toString();
+  return path + (text && `?${text}`);
+}
+
 // [s] as people say it
 export function duration(s) {
   if (s < 90) return `${Math.max(1, Math.round(s))} s`;

@@ -50,6 +50,7 @@ export class JobList {
       isActive && h("button", { onclick: post("cancel", job.kind === "train" && standing.state === "running" ? "It saves a checkpoint, then ends." : null) }, "Cancel"),
       !isActive && standing.state !== "done" && h("button", { onclick: post("resume") }, job.kind === "train" ? "Resume" : "Again"),
       ["train", "evaluate"].includes(job.kind) && h("button", { onclick: () => this.act.again(now) }, "Duplicate…"),
+      job.kind === "train" && job.sweep && h("button", { title: "The curves of all runs of this sweep", onclick: () => this.act.openSweep(job.sweep) }, "Compare"),
       !isActive && h("button", { class: "danger", onclick: () => attempt(() => this.remove(job)) }, "Delete"),
     ];
   }

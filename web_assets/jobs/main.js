@@ -6,6 +6,7 @@ import { api } from "../dataset/api.js";
 import { attempt, h } from "../dataset/dom.js";
 import { EvaluateForm } from "./evaluate_form.js";
 import { EvaluationView } from "./evaluation_view.js";
+import { link } from "./fields.js";
 import { JobList } from "./job_list.js";
 import { RunView } from "./run_view.js";
 import { TrainForm } from "./train_form.js";
@@ -22,6 +23,7 @@ const list = new JobList(at("jobs"), {
   open: (job) => go({ job: job.job.job_id, runs: job.job.kind === "train" ? [job.job.subject] : [], evaluation: evaluationOf(job), against: null }),
   openRun: (name, isMore) => go({ job: null, runs: isMore ? toggled(page.runs, name) : [name], evaluation: null }),
   openEvaluation: (id) => go({ job: null, runs: [], evaluation: id, against: null }),
+  openSweep: (name) => go({ job: null, runs: jobs.filter(({ job }) => job.sweep === name).map(({ job }) => job.subject), evaluation: null }),
   again: (job) => again(job),
   changed: () => look(true),
 });
@@ -102,7 +104,7 @@ at("top").append(
   h("b", {}, "Comp-ACT Studio"),
   h("nav", {},
     h("a", { href: "/", target: "_top" }, "Drive"),
-    h("a", { href: "/dataset" }, "Dataset"),
+    h("a", { href: link("/dataset") }, "Dataset"),
     Object.entries(VIEWS).map(([view, label]) => h("a", { href: `/train?tab=${view}`, "data-view": view, onclick: (event) => { event.preventDefault(); go({ view }); } }, label))),
   h("span", { class: "silence" }, "The studio does not answer; jobs go on by themselves."),
   h("span", { class: "note" }, "Jobs run behind everything else on this machine, and leave one core to the live session."),

@@ -4,6 +4,7 @@ import { api } from "../dataset/api.js";
 import { attempt, h } from "../dataset/dom.js";
 import { exactDate } from "../dataset/format.js";
 import { Chart, COLORS } from "./curves.js";
+import { link } from "./fields.js";
 import { progressOf } from "./job_list.js";
 
 const GROUPS = ["position", "rotation", "gripper", "stiffness", "joints", "kl"];
@@ -127,12 +128,12 @@ const damaged = (metrics) => (metrics?.damaged ? h("p", { class: "why" }, `${met
 function chain(run) {
   const { origin, config } = run;
   const takes = origin.collection
-    ? h("a", { href: `/dataset?collection=${encodeURIComponent(origin.collection)}` }, `collection ${origin.collection}`)
-    : h("a", { href: `/dataset?task=${encodeURIComponent(run.task)}&outcome=success` }, `${run.task}, successful`);
+    ? h("a", { href: link("/dataset", { collection: origin.collection }) }, `collection ${origin.collection}`)
+    : h("a", { href: link("/dataset", { task: run.task, outcome: "success" }) }, `${run.task}, successful`);
   const code = [origin.versions?.studio && `studio ${origin.versions.studio}`, origin.versions?.commit].filter(Boolean).join(" · ");
   return h("dl", { class: "chain" },
     h("dt", {}, "Learned from"), h("dd", {}, `${run.takes.length} takes of `, takes, h("details", {}, h("summary", {}, "which"), h("ul", {}, run.takes.map((take) => h("li", {},
-      h("a", { href: `/dataset?episode=${encodeURIComponent(take.episode_id)}` }, take.episode_id), h("small", { class: "dim" }, take.edit_version ? ` edit ${take.edit_version}` : "")))))),
+      h("a", { href: link("/dataset", { episode: take.episode_id }) }, take.episode_id), h("small", { class: "dim" }, take.edit_version ? ` edit ${take.edit_version}` : "")))))),
     h("dt", {}, "Settings"), h("dd", {}, `${config.policy}, ${config.preset}, ${config.images ? "images" : "no images"}, ${config.wrench ? "F/T" : "no F/T"}, seed ${config.seed}`,
       h("details", {}, h("summary", {}, "all"), h("ul", {}, Object.entries(config).map(([name, value]) => h("li", {}, `${name.replaceAll("_", " ")} `, h("b", {}, String(value))))))),
     code && [h("dt", {}, "Code"), h("dd", {}, code)],
