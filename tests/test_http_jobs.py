@@ -176,6 +176,7 @@ def test_the_form_says_what_the_command_line_says() -> None:
     assert json.loads(json.dumps(train_form()))["presets"]["paper"]["backbone"] == "resnet18"
 
 
+@pytest.mark.verify
 def test_the_time_of_a_run_is_measured(client: Client) -> None:
     told = client.jobs.estimate("wiping", config={**changes(), "steps": 1000}, threads=1)
     assert told.step_seconds > 0

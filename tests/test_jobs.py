@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from visitor import wait_for
 from studio import runs
 from studio.api import DemoReport, Studio
 from studio.jobs import plans
-from studio.jobs.job import STATE
+from studio.jobs.job import JOB, STATE, Standing, write_json
 from studio.jobs.plans import Request, Where
 from studio.jobs.queue import JobBusyError, JobNow, Jobs
 
@@ -111,6 +112,8 @@ def test_training_goes_on_after_everything_was_killed(studio: Studio) -> None:
     at_work(studio, now.job.job_id, done=5)
     with pytest.raises(ValueError, match="is learning"):
         runs.delete(studio.data_dir, "learner")
+    with pytest.raises(RuntimeError, match="Another process lets learner learn already"):
+        studio.train(studio.run("learner"))  # as somebody may by hand
     told = studio.jobs.get(now.job.job_id).standing
     for pid in (told.pid, told.command_pid):
         os.kill(pid or 0, signal.SIGKILL)
@@ -225,6 +228,25 @@ def test_folders_that_somebody_edited_are_told_apart(studio: Studio) -> None:
     assert studio.jobs.get(damaged).standing.state == "queued"
 
 
+def test_a_job_on_a_cluster_that_is_gone_can_be_given_up(studio: Studio) -> None:
+    studio.jobs.slots = 0
+    job = studio.submit(export(studio)).job
+    folder = studio.jobs.folder(job.job_id)
+    nobody = "http://127.0.0.1:9"
+    write_json(folder / JOB, dataclasses.replace(job, runner=nobody, grace=0.0))
+    write_json(folder / STATE, Standing("running", queued=1.0, started=2.0, handle="somewhere"))
+    studio.jobs.advance()
+    told = studio.jobs.get(job.job_id).standing
+    assert (told.state, told.why) == ("lost", f"{nobody} does not answer.")
+    with pytest.raises(JobBusyError, match="is lost; cancel it first"):
+        studio.jobs.delete(job.job_id)
+    studio.jobs.cancel(job.job_id)
+    time.sleep(0.01)
+    studio.jobs.advance()
+    assert studio.jobs.get(job.job_id).standing.state == "cancelled"
+    studio.jobs.delete(job.job_id)
+
+
 def test_a_job_whose_folder_is_removed_ends(studio: Studio) -> None:
     now = at_work(studio, studio.submit(demo(studio)).job.job_id)
     shutil.rmtree(studio.jobs.folder(now.job.job_id))
@@ -300,6 +322,7 @@ def test_jobs_go_on_when_the_server_is_killed(studio: Studio) -> None:
     assert len(studio.episodes(task="wiping")) == 4
 
 
+@pytest.mark.verify
 def test_a_disk_that_is_full_fails_the_job_with_its_reason(studio: Studio) -> None:
     def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # a checkpoint is larger
