@@ -231,12 +231,17 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _commit() -> dict[str, str]:
-    """Which code, where this is a checkout, which is only looked at: its index is not refreshed."""
-    command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent)]
-    command += ["describe", "--always", "--dirty", "--abbrev=12"]
+    """Which code, where this is a checkout, which is only looked at: `git describe` would lock its index."""
+
+    def ask(*words: str) -> str:
+        command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent), *words]
+        return subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=True).stdout.strip()
+
     with suppress(OSError, subprocess.SubprocessError):
-        told = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=True)
-        return {"commit": told.stdout.strip()}
+        if Path(ask("rev-parse", "--show-toplevel")) != Path(__file__).parent.parent.resolve():
+            return {}  # somebody else's, in which we are installed
+        changed = ask("status", "--porcelain", "--untracked-files=no")
+        return {"commit": ask("rev-parse", "--short=12", "HEAD") + ("-dirty" if changed else "")}
     return {}
 
 
