@@ -165,8 +165,12 @@ def test_a_trim_leaves_out_what_an_export_leaves_out(rig: Rig, looking: Page, tm
     drag(looking, ruler, 1.0 - 3 / box["width"], 0.75)  # the handle at the end
     trim = wait_for(lambda: (t := rig.said(wipe).trim) and t[1] < duration - 0.1 and t)
     assert trim == pytest.approx((0.25 * duration, 0.75 * duration), abs=0.05)
-    shades = [shade.bounding_box() for shade in looking.locator(".shade").all()]
-    assert [shade["width"] / box["width"] for shade in shades if shade] == pytest.approx([0.25] * 2, abs=0.01)
+
+    def shaded() -> list[float]:
+        shades = [shade.bounding_box() for shade in looking.locator(".shade").all()]
+        return [shade["width"] / box["width"] for shade in shades if shade]
+
+    wait_for(lambda: shaded() == pytest.approx([0.25] * 2, abs=0.01))  # the page hears of it after the studio
     rig.studio.export([wipe], tmp_path / "out", "lerobot")
     rows = pq.read_table(tmp_path / "out" / DATA_PATH.format(chunk_index=0, file_index=0)).num_rows
     assert rows == int((trim[1] - trim[0]) * 20 + 1e-6) + 1
