@@ -34,7 +34,7 @@ export class Chart {
     this.plot?.destroy();
     this.plot = new uPlot({
       ...this.size(),
-      scales: { x: { time: false }, y: { distr: this.isLog ? 3 : 1, range: this.isLog ? undefined : (_, low, high) => spread(low, high) } },
+      scales: { x: { time: false }, y: { distr: this.isLog ? 3 : 1, range: (_, low, high) => (this.isLog ? decades(low, high) : spread(low, high)) } },
       axes: [{ ...AXIS, size: 28 }, { ...AXIS, values: (_, ticks) => ticks.map((v) => (v === null ? "" : short(v))) }],
       series: [{ label: "step" }, ...drawn.map(({ label, color, isDashed, hasPoints }) => ({
         label, stroke: color, width: isDashed ? 1 : 1.6, dash: isDashed ? [4, 3] : undefined, spanGaps: true,
@@ -55,6 +55,13 @@ function spread(low, high) {
   if (low === null || high === null) return [0, 1];
   const margin = 0.05 * (high - low || Math.abs(high) || 1);
   return [low >= 0 ? Math.max(0, low - margin) : low - margin, high + margin];
+}
+
+// Of a logarithmic scale: as much above and below, and at least half a decade.
+function decades(low, high) {
+  if (!(low > 0)) return [0.1, 1];
+  const margin = Math.max(1.15, Math.sqrt(3 / (high / low)));
+  return [low / margin, high * margin];
 }
 
 function short(v) {

@@ -108,7 +108,7 @@ export function progressOf({ job, standing, progress, seconds_left: left }) {
   if (!progress || standing.state === "queued") return null;
   const share = progress.total ? Math.min(1, progress.done / progress.total) : 0;
   const done = job.kind === "export" ? `${Math.round(100 * share)} %` : `${Math.round(progress.done)} of ${Math.round(progress.total)} ${WHAT[job.kind]}`;
-  const rest = standing.state !== "running" ? "" : left ? `, ${duration(left)} left` : progress.what ? `, ${progress.what}` : ", begins";
+  const rest = standing.state !== "running" ? "" : left ? `, ${duration(left)} left` : progress.what ? `, ${progress.what}` : share === 1 ? ", ends" : ", begins";
   return h("div", { class: "progress", title: progress.what },
     h("div", { class: "track", role: "progressbar", "aria-valuenow": Math.round(100 * share), "aria-valuemin": 0, "aria-valuemax": 100, "aria-label": job.title }, h("i", { style: { width: `${100 * share}%` } })),
     h("small", {}, done + rest));
