@@ -140,7 +140,7 @@ class ViewIn(Body):
 class EpisodeIds(Body):
     """Some takes."""
 
-    episode_ids: Annotated[list[Name], Field(min_length=1, max_length=MOST)]
+    episode_ids: Annotated[list[Name], Field(min_length=1, max_length=100_000)]
 
 
 @dataclass(frozen=True, slots=True)

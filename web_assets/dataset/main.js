@@ -61,7 +61,7 @@ function scope() {
 }
 
 function examine({ ids, filters }) {
-  return ids ? api.post("/dataset-health", { episode_ids: ids.slice(0, 1000) }) : api.get("/dataset-health", filters);
+  return ids ? api.post("/dataset-health", { episode_ids: ids }) : api.get("/dataset-health", filters);
 }
 
 function ask(changes, isStep = false) {
