@@ -443,6 +443,22 @@ def test_scrubbing_pauses_and_is_drawn_twice() -> None:
     assert drawn(playback, clock, 0.1) == [2.0]
 
 
+def test_a_playback_follows_another_clock_without_jerks() -> None:
+    clock = Hand()
+    playback = Playback(9.0, now=clock)
+    playback.follow(1.0, 2.0)
+    times = drawn(playback, clock, 1.0)
+    assert (times[0], times[-1]) == (1.0, pytest.approx(3.0, abs=2 * FRAME))
+    playback.follow(3.03, 2.0)  # about where it is: it goes on as it went
+    assert playback.time == times[-1]
+    playback.follow(6.0, 2.0)
+    assert playback.time == 6.0
+    playback.follow(5.0, 0.0)
+    assert drawn(playback, clock, 1.0) == [5.0, 5.0]
+    playback.follow(99.0, 0.0)
+    assert playback.time == 9.0
+
+
 def test_a_closed_playback_lets_go() -> None:
     playback = Playback(2.0)
     assert playback.wait() == 0.0

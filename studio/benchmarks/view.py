@@ -20,8 +20,8 @@ SCRUBS = 60
 SIZE = (1280, 800)  # [px]
 NOBODY = 9  # the discard port: viser is not needed here
 
-# An opening lasts from the call to the frame after the one with all cameras, lanes and plots in it; a scrub
-# step until all cameras show the image of the new time, playhead and numbers too.
+# An opening lasts from the call until a frame with all cameras, lanes and plots is painted; a scrub step
+# until one is in which all cameras show the image of the new time, playhead and numbers, too.
 OPEN = """async ({id, cameras}) => {
   const {api} = await import("/assets/dataset/api.js");
   const {EpisodeView} = await import("/assets/episode/view.js");
@@ -29,7 +29,11 @@ OPEN = """async ({id, cameras}) => {
   const section = document.getElementById("episode");
   section.hidden = false;
   document.body.classList.add("viewing");
-  window.painted = () => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+  window.painted = () => new Promise((done) => requestAnimationFrame(() => {
+    const {port1, port2} = new MessageChannel();
+    port1.onmessage = done;
+    port2.postMessage(0); // heard once the frame is painted
+  }));
   window.shown = async (holds) => {
     const cameras = document.getElementsByTagName("canvas");
     while (!holds([...cameras].filter((each) => each.closest(".cameras")))) {
