@@ -32,7 +32,7 @@ studio: $(INSTALLED) $(RENDERS) $(LIBRARIES)
 	$(BIN)/studio replay "$$episode" --check
 
 test: $(WITH_TESTS) $(RENDERS) $(LIBRARIES) chromium check
-	$(BIN)/pytest -q -m "not verify"
+	$(BIN)/pytest -q -m "not verify" -n 2 --dist loadfile
 
 verify: $(WITH_TESTS) $(RENDERS)
 	$(BIN)/pytest -m verify
