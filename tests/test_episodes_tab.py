@@ -190,7 +190,7 @@ def test_a_take_opens_and_is_scrubbed(watcher: Watcher, rig: Rig) -> None:
 
 def test_force_arrow_follows_the_playhead(watcher: Watcher) -> None:
     watcher.open("wiping 8")
-    watcher.scrub(1.0)
+    watcher.scrub(0.1)
     time.sleep(2 * SETTLE)
     before = len(watcher.scene)
     watcher.scrub(4.0)

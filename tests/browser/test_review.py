@@ -123,7 +123,7 @@ def test_scrubbing_moves_the_force_arrow(review: Review, rig: Rig, page: Page) -
         _, contact, _ = Cursor(episode).arms[0].phases
         pressing = round((contact.start + contact.end) / 2, 2)
         newtons = float(np.linalg.norm(Cursor(episode).at(pressing).arms[0].wrench.force))
-    enter_time(page, 1.0)
+    enter_time(page, 0.1)
     expect(page.locator(".readout .free")).to_be_visible()
     assert arrow_of(rig.client) is None
     enter_time(page, pressing)
@@ -133,7 +133,7 @@ def test_scrubbing_moves_the_force_arrow(review: Review, rig: Rig, page: Page) -
     assert arrow is not None
     assert arrow[1, 2] > arrow[0, 2] + 0.015  # the board pushes the tool up
     wait_until(lambda: is_teal(rig.client, arrow.mean(axis=0)))
-    enter_time(page, 1.0)
+    enter_time(page, 0.1)
     wait_until(lambda: not is_teal(rig.client, arrow.mean(axis=0)))
 
 

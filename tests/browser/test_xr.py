@@ -162,6 +162,7 @@ def press_until(ana: Operator, stage: Site, newtons: float) -> float:
         if np.linalg.norm(stage.arm(0).wrench[:3]) > newtons:
             break
         ana.move("right", 0.0, -0.01, 0.0, steps=2)
+        ana.page.wait_for_timeout(100)  # the arm follows, also on a busy machine
     ana.page.wait_for_timeout(500)
     ana.pulses()
     ana.page.wait_for_timeout(500)
