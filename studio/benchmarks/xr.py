@@ -26,8 +26,8 @@ from studio.messages import EndTake, StartTake, Status
 TASK = "peg-cylinder"  # two arms, three cameras
 FPS = 60.0  # [Hz] at which latency is measured
 SLOW, FAST = 20.0, 120.0  # [Hz] between which the cost is measured
-ROUNDS = 4
-SECONDS = 8.0  # of each measurement
+ROUNDS, ROUND = 9, 3.0  # [s] of each rate in a round
+SECONDS = 8.0  # of a measurement of latency
 STEP = 2e-5  # [m] that both hands move from frame to frame, always onward: every pose is another
 MENU = 5  # index of the button that engages
 
@@ -231,16 +231,16 @@ def _latency(headset: Headset, recording: Recording) -> tuple[Array, float]:
 
 
 def _cost_of_frames(headset: Headset, pids: tuple[int, ...]) -> float:
-    """[s] of processors' time for a frame: from many and few of them, in turns."""
-    used = {SLOW: 0.0, FAST: 0.0}
-    frames = {SLOW: 0, FAST: 0}
-    for headset.fps in (SLOW, FAST) * ROUNDS:
-        headset.sent = []
+    """[s] of processors' time for a frame: from many and few of them, in turns, the median of the rounds."""
+
+    def measured(fps: float) -> Array:
+        headset.fps, headset.sent = fps, []
         before = sum(map(_cpu_time, pids))
-        time.sleep(SECONDS / ROUNDS)
-        used[headset.fps] += sum(map(_cpu_time, pids)) - before
-        frames[headset.fps] += len(headset.sent)
-    return (used[FAST] - used[SLOW]) / (frames[FAST] - frames[SLOW])
+        time.sleep(ROUND)
+        return np.array([sum(map(_cpu_time, pids)) - before, len(headset.sent)])
+
+    rounds = np.array([measured(FAST) - measured(SLOW) for _ in range(ROUNDS)])  # [s], frames
+    return float(np.median(rounds[:, 0] / rounds[:, 1]))
 
 
 def _cpu_time(pid: int) -> float:
