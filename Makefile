@@ -32,7 +32,8 @@ studio: $(INSTALLED) $(RENDERS) $(LIBRARIES)
 	$(BIN)/studio replay "$$episode" --check
 
 test: $(WITH_TESTS) $(RENDERS) $(LIBRARIES) chromium check
-	$(BIN)/pytest -q -m "not verify" -n 2 --dist loadfile
+	$(BIN)/pytest -q -m "not verify" -n 2 --dist loadfile --ignore tests/browser
+	$(BIN)/pytest -q -m "not verify" tests/browser  # each needs the cores for itself
 
 verify: $(WITH_TESTS) $(RENDERS)
 	$(BIN)/pytest -m verify
