@@ -2,7 +2,8 @@
 
 On loopback everybody on this machine may come in. On any other address a token is needed: opening the link
 with it gives the browser a cookie and takes the token off the address; a program sends it as `Authorization:
-Bearer …`. Each route learns from `person_of(connection)` who asks, e.g. for `studio.lease.Lease.sit`.
+Bearer …`, and gets a cookie, too. Each route learns from `person_of(connection)` who asks, e.g. for
+`studio.lease.Lease.sit`: who shows the same cookie again is the same person.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from html import escape
 from urllib.parse import parse_qsl, urlencode
 
 from starlette.datastructures import URL, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -32,6 +34,9 @@ PAGE_HEADERS = {
 }
 COOKIE_AGE = 30 * 24 * 3600  # [s] after its last use a browser must show the token again
 PERSON = "studio.person"  # where the scope holds the person
+BODY_LIMIT = 8 * 1024 * 1024  # [bytes] of a request; a collection of 100,000 takes has half of it
+
+TOO_LARGE = f"A request may have {BODY_LIMIT // 2**20} MB."
 
 Check = Callable[[HTTPConnection], str | None]
 
@@ -74,14 +79,14 @@ class Access:
         return cls(secrets.token_urlsafe(), False, cookie, is_secure)
 
     def person(self, connection: HTTPConnection) -> PersonId | None:
-        """Who shows a cookie of ours, or the token itself; None otherwise."""
+        """Who shows a cookie of ours; None otherwise."""
         person, _, signature = connection.cookies.get(self.cookie, "").partition(".")
-        if person and _is_same(signature, self._sign(person)):
-            return PersonId(person)
+        return PersonId(person) if person and _is_same(signature, self._sign(person)) else None
+
+    def has_token(self, connection: HTTPConnection) -> bool:
+        """Whether a program shows the token itself."""
         scheme, _, token = connection.headers.get("authorization", "").partition(" ")
-        if scheme.lower() == "bearer" and self.is_token(token.strip()):
-            return PersonId("program")
-        return None
+        return scheme.lower() == "bearer" and self.is_token(token.strip())
 
     def is_token(self, text: str) -> bool:
         return self.is_asked_for and _is_same(text, self.secret)
@@ -118,7 +123,7 @@ class Door:
 
         connection, access = HTTPConnection(scope), self._access
         reason = next((reason for check in self._checks if (reason := check(connection))), None)
-        person = access.person(connection)
+        person, is_program = access.person(connection), access.has_token(connection)
         app = self._app
         if reason is not None:
             app = refuse(403, reason)
@@ -127,13 +132,16 @@ class Door:
                 app, cookie = _without_token(connection.url), access.cookie_for(person or _new_person())
             else:
                 app = _unauthorized(connection, "This token is not, or no longer, valid.")
-        elif person is None and access.is_asked_for:
+        elif person is None and access.is_asked_for and not is_program:
             app = _unauthorized(connection, "You need the link, or the token in it.")
+        elif _declared_length(connection) > BODY_LIMIT:
+            app = refuse(413, TOO_LARGE)
         else:
             scope[PERSON] = person or _new_person()
-            if _wants_page(connection):  # also to who has one, so that it does not grow old
+            # Also to a browser that has one, so that it does not grow old.
+            if _wants_page(connection) or (is_program and person is None):
                 cookie = access.cookie_for(scope[PERSON])
-        await app(scope, receive, send_with_headers)
+        await app(scope, _bounded(receive), send_with_headers)
 
 
 def known_host(host: str) -> Check:
@@ -159,6 +167,28 @@ def same_origin(connection: HTTPConnection) -> str | None:
         if not separator or authority != host:
             return f"Refused: the request comes from a page of {origin!r}, not from {host!r}."
     return None
+
+
+def _declared_length(connection: HTTPConnection) -> int:
+    """[bytes] of the body that a request says it has."""
+    length = connection.headers.get("content-length", "")
+    return int(length) if length.isascii() and length.isdigit() else 0
+
+
+def _bounded(receive: Receive) -> Receive:
+    """Ends a body that goes on beyond the limit without having said so."""
+    taken = 0
+
+    async def bounded() -> Message:
+        nonlocal taken
+        message = await receive()
+        if message["type"] == "http.request":
+            taken += len(message.get("body", b""))
+            if taken > BODY_LIMIT:
+                raise HTTPException(413, TOO_LARGE)
+        return message
+
+    return bounded
 
 
 def in_url(host: str) -> str:

@@ -93,7 +93,7 @@ class Lease:
             seat = Seat(self, person)
             self._seats.append(seat)
             self._numbers.setdefault(person, f"{kind} {len(self._numbers) + 1}")
-            if name:
+            if name := _clean(name):
                 self._names.setdefault(person, name)
             if person == self._holder:
                 self._left = None

@@ -248,6 +248,25 @@ def test_evaluate_refuses_nonsense(studio: Run, tmp_path: Path) -> None:
         assert words in complaint
 
 
+def test_a_part_that_cannot_be_measured_costs_the_others_nothing(
+    studio: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> None:
+        raise TimeoutError("the disk is [slow]")
+
+    monkeypatch.setattr("studio.benchmarks.cameras.measure", refuse)
+    monkeypatch.setattr("studio.benchmarks.loop.measure", lambda: {"one_arm": 9.0, "two_arms": 3.0})
+    status, text, _ = studio("bench", "--only", "cameras", "loop", "--json")
+    told = last_json(text)
+    assert status == 1
+    assert told["failed"] == {"cameras": "TimeoutError: the disk is [slow]"}
+    assert [goal["met"] for goal in told["goals"]] == [True, False]
+    status, text, _ = studio("bench", "--only", "cameras", "loop")
+    assert status == 1
+    assert "cameras failed: TimeoutError: the disk is [slow]" in text
+    assert studio("bench", "--only", "loop")[0] == 0  # a goal that is missed is no failure
+
+
 def test_references_are_one_table(studio: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in REFERENCES.keys() - {"demonstrator", "all-high"}:
         monkeypatch.delitem(REFERENCES, name)

@@ -36,6 +36,10 @@ def make_front(**options: object) -> FrontServer:
     async def change(request: Request) -> str:
         return person_of(request)
 
+    @app.post("/size")
+    async def size(request: Request) -> int:
+        return len(await request.body())
+
     @app.websocket("/ws/who")
     async def socket(websocket: WebSocket) -> None:
         await websocket.accept()
@@ -125,9 +129,12 @@ def test_a_cookie_that_was_made_up_or_is_of_another_token_is_none(front: FrontSe
         assert httpx.get(f"{front.url}/who", headers=headers).status_code == 401
 
 
-def test_a_program_shows_the_token_itself(front: FrontServer) -> None:
+def test_a_program_shows_the_token_itself_and_is_known_again_by_its_cookie(front: FrontServer) -> None:
     headers = {"Authorization": f"Bearer {TOKEN}"}
-    assert httpx.get(f"{front.url}/who", headers=headers).json() == "program"
+    with httpx.Client(headers=headers) as one, httpx.Client(headers=headers) as other:
+        who = one.get(f"{front.url}/who").json()
+        assert one.get(f"{front.url}/who").json() == who
+        assert other.get(f"{front.url}/who").json() != who  # or it would drive with the other's lease
 
 
 def test_a_page_from_elsewhere_is_refused_whatever_cookie_its_browser_has(front: FrontServer) -> None:
@@ -137,6 +144,18 @@ def test_a_page_from_elsewhere_is_refused_whatever_cookie_its_browser_has(front:
         url = f"ws://localhost:{front.port}/ws/who"
         with pytest.raises(InvalidStatus, match="403"):
             connect(url, additional_headers=browser.cookie | origin, proxy=None)
+
+
+@pytest.mark.parametrize("is_declared", [True, False])
+def test_a_body_of_ten_megabytes_is_refused_and_not_kept(is_declared: bool) -> None:
+    def body(n: int) -> bytes | Iterator[bytes]:
+        return bytes(n) if is_declared else iter([bytes(1_000_000)] * (n // 1_000_000))
+
+    with make_front() as front:
+        assert httpx.post(f"{front.url}/size", content=body(8_000_000)).json() == 8_000_000
+        answer = httpx.post(f"{front.url}/size", content=body(10_000_000))
+        assert answer.status_code == 413
+        assert "8 MB" in answer.text
 
 
 def test_on_loopback_each_browser_is_somebody_without_a_token() -> None:

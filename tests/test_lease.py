@@ -184,6 +184,9 @@ def test_names_are_what_people_typed_in_one_line(room: Room) -> None:
     guest.rename("  Ana\n\x1b[31m  B. " + 200 * "x")
     assert room.lease.holder_name.startswith("Ana [31m B. xxx")
     assert len(room.lease.holder_name) == 60
+    ben = room.sit(BEN, "Ben\n\x1b[31m" + 200 * "x")  # a program gives its name as it comes
+    assert ben.words.startswith("Ben [31mxxx")
+    assert len(ben.words) == 60
 
 
 def test_time_passes_by_itself() -> None:

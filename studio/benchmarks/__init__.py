@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,8 @@ PARTS = (
 
 Results = dict[str, Any]  # what a part measured
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, slots=True)
 class Goal:
@@ -54,17 +57,23 @@ class Goal:
 def run(only: Sequence[str] = (), tell: Callable[[str], None] | None = None) -> Results:
     """Measure all parts, or `only` some, one after the other; `tell` is told the name of each as it begins.
 
-    The load average stands beside each part, as of its end: other programs slow what is measured.
+    The load average stands beside each part, as of its end: other programs slow what is measured. A part that
+    cannot be measured costs the others nothing: why not stands under "failed", and its goals are left out.
     """
     unknown = set(only) - set(PARTS)
     if unknown:
         raise KeyError(f"No part {', '.join(sorted(unknown))}; there are {list(PARTS)}.")
-    results: Results = {"machine": {**versions(), "cores": os.cpu_count()}}
+    results: Results = {"machine": {**versions(), "cores": os.cpu_count()}, "failed": {}}
     for part in only or PARTS:
         if tell:
             tell(part)
-        measured = importlib.import_module(f"{__name__}.{part}").measure()
-        results[part] = {**measured, "load_average": os.getloadavg()[0]}
+        try:
+            measured = importlib.import_module(f"{__name__}.{part}").measure()
+        except Exception as error:  # whatever breaks in one part
+            log.exception("The part %s failed.", part)
+            results["failed"][part] = f"{type(error).__name__}: {error}"
+        else:
+            results[part] = {**measured, "load_average": os.getloadavg()[0]}
     results["goals"] = [goal.against(results[goal.part]) for goal in GOALS if goal.part in results]
     return results
 

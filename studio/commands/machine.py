@@ -17,15 +17,18 @@ def doctor(json: Json = False) -> int:
 def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
     """Measure speed and contact on this machine: medians, with the load average beside them.
 
+    Exit status 1 where a part could not be measured; a goal that is missed is only told.
+
     Args:
         only: Run only these parts.
     """
     from studio.benchmarks import PARTS, run
 
     results = run(only, tell=None if json else lambda name: console.print(f"… {name}", style="dim"))
+    failed = results["failed"]
     if json:
         print_json(results)
-        return 0
+        return bool(failed)
     table = table_of("part", "what", ">measured", "goal", "met")
     for goal in results["goals"]:
         verdict = "yes" if goal["met"] else "NO"
@@ -33,4 +36,6 @@ def bench(only: tuple[str, ...] = (), json: Json = False) -> int:
     console.print(table)
     loads = ", ".join(f"{part} {results[part]['load_average']:.1f}" for part in PARTS if part in results)
     console.print(f"Load average: {loads}. Everything measured: studio bench --json")
-    return 0
+    for part, why in failed.items():
+        console.print(f"{part} failed: {why}", style="red", markup=False, soft_wrap=True)
+    return bool(failed)
