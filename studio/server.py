@@ -214,7 +214,9 @@ class FrontServer:
         self._thread.join()
 
     def _door(self) -> Door:
-        cookie, is_secure = f"studio_{self.port}", self._certificate is not None
+        is_secure = self._certificate is not None
+        # Browsers hold "__Host-" to this host and TLS. Without TLS they would replace no cookie of that name.
+        cookie = f"{'__Host-' * is_secure}studio_{self.port}"
         if self.token is None:
             checks = [known_host(self._host), same_origin]
             return Door(self._app, checks, Access.of_everybody(cookie, is_secure))

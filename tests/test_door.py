@@ -218,6 +218,8 @@ def test_tls_with_the_certificate_of_this_installation(home: Path) -> None:
         with httpx.Client(base_url=front.url, verify=trusting) as browser:
             answer = browser.get("/who", params={"token": TOKEN})
             assert "; Secure" in answer.headers["Set-Cookie"]
+            # Another name than without TLS, where browsers leave this one alone and would let nobody in.
+            assert answer.headers["Set-Cookie"].startswith(f"__Host-studio_{front.port}=")
             who = browser.get("/who").json()
             headers = {
                 "Cookie": "; ".join(f"{n}={v}" for n, v in browser.cookies.items()),
