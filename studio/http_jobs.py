@@ -21,7 +21,7 @@ from studio.api import Studio
 from studio.export import Format, Options
 from studio.http_wire import Body, FiltersIn, Name, Problem, as_json, refusals
 from studio.jobs import plans
-from studio.jobs.job import Job
+from studio.jobs.job import LOCAL, Job
 from studio.jobs.plans import Request, Where
 from studio.jobs.queue import JobNow
 
@@ -29,7 +29,6 @@ REFUSED: dict[int | str, dict[str, Any]] = {
     404: {"model": Problem, "description": "There is no such job, run, take or collection"},
     409: {"model": Problem, "description": "Not now: it runs, or it is over, or the name is taken"},
 }
-MOST_OF_A_SWEEP = 64  # jobs
 JobId = Annotated[str, InPath(max_length=200)]
 Seed = Annotated[int, Field(ge=0, le=2**31)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
@@ -44,9 +43,12 @@ class Asked(Body):
     """That learn together, through torchrun."""
     threads: Annotated[int, Field(ge=0, le=256)] = 0
     """Of the CPU, for each process; 0 leaves one core to others."""
+    runner: Name = LOCAL
+    """This machine, or a Ray cluster that sees the data folder, by its address: http://head:8265. There a job
+    whose device is cuda has a GPU for each process, any other none."""
 
     def where(self) -> Where:
-        return Where(author=self.author, processes=self.processes, threads=self.threads)
+        return Where(**self.model_dump(include=set(Asked.model_fields)))
 
 
 class TrainIn(Asked):

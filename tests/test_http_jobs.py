@@ -122,6 +122,9 @@ def test_what_is_refused_says_why_and_queues_nothing(site: Site, client: Client)
         ({"kind": "export", "name": "x"}, 422, "Say which takes"),
         ({"kind": "export", "name": "x", "episode_ids": ["y"]}, 404, "No episode 'y'"),
         ({"kind": "dance"}, 422, "dance"),
+        ({"kind": "demo", "task": "wiping", "runner": "head:8265"}, 422, "told like http://head:8265"),
+        ({"kind": "demo", "task": "wiping", "runner": "http://127.0.0.1:9"}, 422, "does not answer"),
+        ({"kind": "demo", "task": "wiping", "runner": site.front.url}, 422, "knows no version"),
     ]
     for asked, status, why in cases:
         with pytest.raises(Refused) as refused:
@@ -169,10 +172,14 @@ def test_the_form_says_what_the_command_line_says() -> None:
     properties = train_form()["schema"]["properties"]
     assert properties.keys() == {field.name for field in dataclasses.fields(TrainConfig)}
     for name, field in properties.items():
-        assert f"--{name.replace('_', '-')}" in words or f"--no-{name.replace('_', '-')}" in words
+        assert field["flag"] in words or f"--no-{field['flag'][2:]}" in words
         assert " ".join(field["description"].split()) in words
         assert field["default"] == getattr(PRESETS["small"], name)
-    assert properties["lr"]["group"] == "Optimisation"
+    assert (properties["lr"]["group"], properties["lr"]["title"]) == ("Optimisation", "Learning rate")
+    assert (properties["chunk_seconds"]["unit"], properties["chunk_seconds"]["flag"]) == (
+        "s",
+        "--chunk-seconds",
+    )
     assert json.loads(json.dumps(train_form()))["presets"]["paper"]["backbone"] == "resnet18"
 
 

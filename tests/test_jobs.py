@@ -8,8 +8,10 @@ import os
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -22,7 +24,7 @@ from visitor import wait_for
 
 from studio import runs
 from studio.api import DemoReport, Studio
-from studio.jobs import plans
+from studio.jobs import cluster, plans
 from studio.jobs.job import JOB, STATE, Standing, write_json
 from studio.jobs.plans import Request, Where
 from studio.jobs.queue import JobBusyError, JobNow, Jobs
@@ -247,6 +249,29 @@ def test_a_job_on_a_cluster_that_is_gone_can_be_given_up(studio: Studio) -> None
     studio.jobs.delete(job.job_id)
 
 
+def test_a_cluster_that_is_silent_keeps_nobody_waiting(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "TIMEOUT", 0.7)
+    studio.jobs.slots = 0
+    here, *there = (studio.submit(export(studio, name)).job for name in "abcd")
+    with socket.create_server(("127.0.0.1", 0)) as head:  # takes every call, and answers none
+        for job in there:
+            folder = studio.jobs.folder(job.job_id)
+            address = f"http://127.0.0.1:{head.getsockname()[1]}"
+            write_json(folder / JOB, dataclasses.replace(job, runner=address))
+            write_json(folder / STATE, Standing("running", queued=1.0, started=2.0, handle=job.job_id))
+        begun = time.monotonic()
+        looking = threading.Thread(target=studio.jobs.advance)
+        looking.start()
+        Jobs(studio.data_dir).cancel(here.job_id)
+        assert time.monotonic() - begun < 0.5
+        looking.join()
+    assert time.monotonic() - begun < 1.4  # one that is silent is asked once, not for each of its jobs
+    states = {now.job.job_id: now.standing.state for now in studio.jobs.all()}
+    assert states == {here.job_id: "cancelled", **{job.job_id: "lost" for job in there}}
+
+
 def test_a_job_whose_folder_is_removed_ends(studio: Studio) -> None:
     now = at_work(studio, studio.submit(demo(studio)).job.job_id)
     shutil.rmtree(studio.jobs.folder(now.job.job_id))
@@ -295,7 +320,7 @@ def test_curves_follow_a_run_that_is_resumed_and_damaged(tmp_path: Path) -> None
 SUBMIT = """
 import sys, time
 from studio import Studio
-from studio.jobs import plans
+from studio.jobs import cluster, plans
 studio = Studio(sys.argv[1])
 ann = plans.Where(author="ann", threads=1)
 studio.submit(plans.demo(studio.catalog, ann, "wiping", episodes=2, cameras=False))

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from studio.commands import exchange, policies, recording
 from studio.commands.terminal import DATA, Data, Json, console, plain, print_json, table_of
-from studio.jobs.job import Job
+from studio.jobs.job import LOCAL, Job
 from studio.jobs.plans import Request, Where
 from studio.jobs.queue import JobNow, Jobs
 
@@ -34,7 +34,8 @@ def list_jobs(trash: bool = False, data: Data = DATA, json: Json = False) -> int
     found = jobs.all()
     if json:
         return _print(found)
-    table = table_of("id", "state", ">done", ">left", "what", "by", "why")
+    are_here = all(now.job.runner == LOCAL for now in found)
+    table = table_of("id", "state", ">done", ">left", "what", *([] if are_here else ["on"]), "by", "why")
     for now in found:
         table.add_row(
             now.job.job_id,
@@ -42,6 +43,7 @@ def list_jobs(trash: bool = False, data: Data = DATA, json: Json = False) -> int
             _share(now),
             "" if now.seconds_left is None else _duration(now.seconds_left),
             now.job.title,
+            *([] if are_here else [now.job.runner]),
             now.job.author,
             now.standing.why,
         )
@@ -61,6 +63,7 @@ def show(job_id: Positional[JobId], data: Data = DATA, json: Json = False) -> in
         "state": f"{now.standing.state} {now.standing.why}".strip(),
         "done": _share(now),
         "asked": f"{_moment(now.job.created)} by {now.job.author}",
+        "runs on": "this machine" if now.job.runner == LOCAL else now.job.runner,
         "started": _moment(now.standing.started),
         "ended": _moment(now.standing.ended),
         **{f"swept {name}": value for name, value in now.job.swept.items()},
@@ -126,7 +129,7 @@ def submit(
     sweep: tuple[str, ...] = (),
     processes: int = 1,
     threads: int = 0,
-    runner: str = "local",
+    runner: str = LOCAL,
     data: Data = DATA,
     json: Json = False,
 ) -> int:
@@ -137,7 +140,8 @@ def submit(
         sweep: A job for each value, or each combination: lr=1e-4,5e-4 seed=0,1
         processes: That learn together, through torchrun.
         threads: Of the CPU for each process; 0 leaves one core to others.
-        runner: Or the address of a Ray cluster: http://head:8265
+        runner: Or the address of a Ray cluster that sees the data folder: http://head:8265. There a job with
+            --device cuda has a GPU for each process, any other none.
     """
     from studio.api import Studio
     from studio.jobs import plans

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
+from urllib.parse import urlsplit
 
 import msgspec
 
@@ -31,6 +32,7 @@ ENDED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
 JOB, STATE, PROGRESS, LOG, CANCEL, LOCK = (
     *("job.json", "state.json", "progress.json", "log.txt", "cancel", "lock"),
 )
+LOCAL = "local"  # the runner on this machine
 GRACE = 20.0  # [s] that a command has to end by itself, e.g. to save a checkpoint
 NICE = 10  # behind the live session and the page
 LAST_LINES = 12  # of the log, told of a job that failed
@@ -49,12 +51,21 @@ class Job:
     author: str
     created: float  # [s] unix time
     settings: dict[str, Any] = field(default_factory=dict)  # as they were asked for
-    runner: str = "local"  # or the address of a Ray cluster, e.g. http://head:8265
+    runner: str = LOCAL  # or the address of a Ray cluster, e.g. http://head:8265
     processes: int = 1  # that learn together, through torchrun
     threads: int = 1  # of the CPU, for each process
+    gpus: int = 0  # that a cluster shall keep free for it; on this machine nobody counts them
     sweep: str = ""  # names the jobs that were asked for together
     swept: dict[str, Any] = field(default_factory=dict)  # what tells this one from the others
     grace: float = GRACE
+
+    def __post_init__(self) -> None:
+        told = urlsplit(self.runner)
+        is_address = told.scheme in ("http", "https") and told.hostname and not told.path.strip("/")
+        if self.runner != LOCAL and not is_address:
+            raise ValueError(
+                f"Jobs run on {LOCAL!r}, or on a Ray cluster told like http://head:8265, not {self.runner!r}."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +80,7 @@ class Standing:
     exit_code: int | None = None
     pid: int | None = None  # of the keeper
     command_pid: int | None = None  # leads a process group of its own
-    handle: str = ""  # under which the cluster knows it
+    handle: str = ""  # under which the cluster knows it, as soon as it is asked
 
     @property
     def is_over(self) -> bool:

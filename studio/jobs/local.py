@@ -21,7 +21,7 @@ YOUNG = 10.0  # [s] between the start of a process and what its keeper noted, on
 class LocalRunner:
     """Implements `studio.jobs.runner.JobRunner`."""
 
-    def submit(self, job: Job, folder: Path) -> str:
+    def submit(self, job: Job, folder: Path, standing: Standing) -> None:
         """Returns as soon as the command has been started. Raises RuntimeError where it has not."""
         with (folder / LOG).open("ab") as log:
             keeper = subprocess.run(
@@ -35,7 +35,6 @@ class LocalRunner:
         if keeper.returncode:
             told = last_lines(folder, 1)
             raise RuntimeError(f"It could not be started: {told[0] if told else 'nobody knows why'}")
-        return ""
 
     def status(self, job: Job, folder: Path, standing: Standing) -> Found:
         """Its lock tells: whatever kills a process frees it."""

@@ -24,8 +24,8 @@ from studio.catalog import Catalog
 from studio.evaluate import Plan
 from studio.export import Format, Options, choose
 from studio.index import Filters
-from studio.jobs.job import Job, Kind, new_job_id
-from studio.jobs.queue import JobNow, Jobs
+from studio.jobs.job import LOCAL, Job, Kind, new_job_id
+from studio.jobs.queue import JobNow, Jobs, check_runner
 from studio.references import REFERENCES
 from studio.training import TAKES, Chosen, Run
 
@@ -39,7 +39,7 @@ class Where:
     """Who asks, and on what it runs."""
 
     author: str
-    runner: str = "local"
+    runner: str = LOCAL
     processes: int = 1
     threads: int = 0  # 0: one core less than there are, which the live session may use
     sweep: str = ""
@@ -61,7 +61,11 @@ class Request:
 
 
 def submit(jobs: Jobs, request: Request) -> JobNow:
-    """Put a job into the queue. Raises FileExistsError where its run is there already."""
+    """Put a job into the queue.
+
+    Raises FileExistsError where its run is there already, ValueError where its cluster does not answer.
+    """
+    check_runner(request.job.runner)
     if request.run is None:
         return jobs.submit(request.job, request.files)
     folder = request.run.folder
@@ -103,6 +107,7 @@ def train(
             title=f"Train {run.folder.name}",
             command=("train", "--resume", run.folder.name),
             subject=run.folder.name,
+            gpus=where.processes if _is_gpu(config.device) else 0,
             settings={**asked, "takes": len(run.takes), "config": dataclasses.asdict(config)},
         ),
     )
@@ -145,6 +150,7 @@ def evaluate(
             title=f"Evaluate {agent} on {plan.task}",
             command=("evaluate", named, *_flags(asked)),
             subject=agent,
+            gpus=int(_is_gpu(plan.device)),
             settings={"agent": agent, "which": which, "step": plan.spec.step if plan.spec else None, **asked},
         )
     )
@@ -256,6 +262,10 @@ def default_threads(processes: int) -> int:
     """Of each process: all together leave one core to the live session."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, (cores - 1) // processes)
+
+
+def _is_gpu(device: str) -> bool:
+    return device.startswith("cuda")
 
 
 def _job(kind: Kind, where: Where, **fields: Any) -> Job:

@@ -15,6 +15,7 @@ import dataclasses
 import fcntl
 import logging
 import os
+import secrets
 import shutil
 import threading
 import time
@@ -24,15 +25,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from studio.jobs.cluster import RayRunner
 from studio.jobs.job import (
     CANCEL,
     JOB,
+    LOCAL,
     LOG,
     STATE,
     TAIL,
     Job,
     Progress,
     Standing,
+    State,
     last_lines,
     read_job,
     read_progress,
@@ -40,7 +44,7 @@ from studio.jobs.job import (
     write_json,
 )
 from studio.jobs.local import LocalRunner
-from studio.jobs.runner import JobRunner
+from studio.jobs.runner import Found, JobRunner
 
 PERIOD = 1.0  # [s] between two looks at the queue
 
@@ -68,9 +72,7 @@ class Jobs:
     def __init__(self, data_dir: Path) -> None:
         self.data_dir = data_dir.absolute()
         self._folder = self.data_dir / "jobs"
-        self._over: dict[
-            str, tuple[int, JobNow]
-        ] = {}  # jobs that changed no more, by the time of their state
+        self._over: dict[str, tuple[int, JobNow]] = {}  # those that change no more, by when their state did
 
     # What there is
 
@@ -98,7 +100,7 @@ class Jobs:
         folder = self.folder(job_id)
         if not (folder / LOG).exists():
             now = self.get(job_id)
-            text = runner_of(now.job).log(now.job, folder, now.standing).encode()
+            text = runner_of(now.job.runner).log(now.job, folder, now.standing).encode()
             return text[max(0, start) :][:limit].decode(errors="replace"), len(text)
         with (folder / LOG).open("rb") as file:
             size = file.seek(0, os.SEEK_END)
@@ -160,10 +162,7 @@ class Jobs:
             if now.standing.is_over:
                 raise JobBusyError(f"{now.job.title} is {now.standing.state} already.")
             if now.standing.state != "queued" or now.standing.handle:
-                try:
-                    runner_of(now.job).cancel(now.job, folder, now.standing)
-                except RuntimeError as error:
-                    raise JobBusyError(str(error)) from error
+                runner_of(now.job.runner).cancel(now.job, folder, now.standing)
             if now.standing.state == "queued":
                 self._write(folder, now.standing, state="cancelled", why="Cancelled before it began.")
         return self.get(job_id)
@@ -219,14 +218,16 @@ class Jobs:
         """Note which jobs are gone, and start those whose turn it is."""
         if not self._folder.is_dir():
             return
+        told = self._ask_clusters()
         with self._locked():
             for now in self.all():
-                self._settle(now)
+                if now.standing.state == "running" or now.standing.handle:
+                    self._settle(now, told)
             waiting = [now for now in self.all() if now.standing.state == "queued"]
             for now in sorted(waiting, key=lambda now: (now.standing.queued, now.job.job_id)):
                 if now.standing.handle:
                     continue  # the cluster has it
-                if now.job.runner != "local" or self._n_running() < self.slots:
+                if now.job.runner != LOCAL or self._n_running() < self.slots:
                     self._start(now)
 
     @contextmanager
@@ -250,30 +251,45 @@ class Jobs:
             thread.join()
 
     def _start(self, now: JobNow) -> None:
-        folder = self.folder(now.job.job_id)
+        job, standing, folder = now.job, now.standing, self.folder(now.job.job_id)
+        if job.runner != LOCAL:  # noted first, so that it can be found whatever happens next
+            standing = dataclasses.replace(standing, handle=f"{job.job_id}-{secrets.token_hex(2)}")
+            self._write(folder, standing)
         try:
-            handle = runner_of(now.job).submit(now.job, folder)
+            runner_of(job.runner).submit(job, folder, standing)
         except (OSError, RuntimeError) as error:
-            self._write(folder, now.standing, state="failed", why=str(error), ended=time.time())
-            return
-        standing = read_standing(folder)
-        if handle and standing is not None and not standing.handle:
-            self._write(folder, standing, handle=handle)
+            self._write(folder, standing, state="failed", why=str(error), ended=time.time())
 
-    def _settle(self, now: JobNow) -> None:
+    def _ask_clusters(self) -> dict[str, Found]:
+        """What became of each handle. Asked without the lock, as one that is silent takes seconds."""
+        told: dict[str, Found] = {}
+        silent: set[str] = set()
+        for now in self.all():
+            job, standing = now.job, now.standing
+            if job.runner == LOCAL or standing.is_over or not standing.handle:
+                continue
+            found: Found = "lost"
+            if job.runner not in silent:
+                found = runner_of(job.runner).status(job, self._folder / job.job_id, standing)
+            if found == "lost":
+                silent.add(job.runner)
+            told[standing.handle] = found
+        return told
+
+    def _settle(self, now: JobNow, told: Mapping[str, Found]) -> None:
         """Write down what became of one whose processes are gone; of a cluster, whether it answers."""
-        job, standing = now.job, now.standing
-        if standing.is_over or (standing.state == "queued" and not standing.handle):
-            return
-        folder = self.folder(job.job_id)
-        found = runner_of(job).status(job, folder, standing)
-        standing = read_standing(folder) or standing  # what a keeper wrote before it went
-        if standing.is_over:
+        job, folder = now.job, self.folder(now.job.job_id)
+        found: Found | None = told.get(now.standing.handle)
+        if job.runner == LOCAL:
+            found = LocalRunner().status(job, folder, now.standing)
+        standing = read_standing(folder) or now.standing  # what a keeper wrote before it went
+        if standing.is_over or found is None:
             return
         if found == "ended":
-            state = "cancelled" if (folder / CANCEL).exists() else "interrupted"
-            why = "It is gone, without having said why: perhaps the machine was switched off."
-            self._write(folder, standing, state=state, why=why, ended=time.time())
+            state: State = "cancelled" if (folder / CANCEL).exists() else "interrupted"
+            self._write(folder, standing, state=state, why=_why_gone(now, folder), ended=time.time())
+        elif found == "dropped":
+            self._write(folder, standing, state="queued", why="", handle="")
         elif found == "lost" and _was_given_up(folder, job):
             why = f"Cancelled while {job.runner} did not answer; it may go on there."
             self._write(folder, standing, state="cancelled", why=why, ended=time.time())
@@ -308,7 +324,7 @@ class Jobs:
     def _without_standing(self, job: Job, folder: Path) -> Standing:
         """Where somebody has edited or removed the file."""
         unknown = Standing("interrupted", job.created, why=f"{folder / STATE} is missing or damaged.")
-        found = runner_of(job).status(job, folder, unknown)
+        found = runner_of(job.runner).status(job, folder, unknown)
         return dataclasses.replace(unknown, state="running") if found == "running" else unknown
 
     def _active_on(self, job: Job) -> JobNow | None:
@@ -324,7 +340,7 @@ class Jobs:
         return [now for now in asked if not now.standing.is_over]
 
     def _n_running(self) -> int:
-        return sum(now.job.runner == "local" and now.standing.state == "running" for now in self.all())
+        return sum(now.job.runner == LOCAL and now.standing.state == "running" for now in self.all())
 
     def _places(self, job: Job) -> list[tuple[Path, Path]]:
         """Where it lies, and where in the trash."""
@@ -359,10 +375,23 @@ def _was_given_up(folder: Path, job: Job) -> bool:
     return False
 
 
-def runner_of(job: Job) -> JobRunner:
-    """Where it runs."""
-    if job.runner == "local":
-        return LocalRunner()
-    from studio.jobs.cluster import RayRunner
+def _why_gone(now: JobNow, folder: Path) -> str:
+    """What is known of one that ended without a word from its keeper."""
+    if now.job.runner != LOCAL and now.standing.started is None:
+        said = runner_of(now.job.runner).log(now.job, folder, now.standing).strip().splitlines()
+        return f"{now.job.runner} could not start it{f': {said[-1][:300]}' if said else '.'}"
+    return "It is gone, without having said why: perhaps the machine was switched off."
 
-    return RayRunner(job.runner)
+
+def check_runner(runner: str) -> None:
+    """Raises ValueError where no job can be sent there now."""
+    if runner != LOCAL:
+        try:
+            RayRunner(runner).check()
+        except RuntimeError as error:
+            raise ValueError(str(error)) from error
+
+
+def runner_of(runner: str) -> JobRunner:
+    """The place of that name, which a `Job` has checked."""
+    return LocalRunner() if runner == LOCAL else RayRunner(runner)
