@@ -31,7 +31,7 @@ class Pose:
     wxyz: Array  # (4,) unit quaternion
 
     def __post_init__(self) -> None:
-        norm = math.sqrt(float(self.wxyz @ self.wxyz))
+        norm = math.hypot(*self.wxyz.tolist())
         if not abs(norm - 1.0) < 1e-6:  # also catches NaN
             raise ValueError(f"Quaternion {self.wxyz} has norm {norm}; a pose needs a unit quaternion.")
 

@@ -7,7 +7,6 @@ turns as the hand turns, both since the moment of engagement, so that engaging m
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -61,19 +60,18 @@ class Clutch:
         self._grip, self.why = None, why
 
 
-@dataclass(frozen=True, slots=True)
 class _Grip:
     """Where hand and target were when the clutch took hold."""
 
-    hand: Pose
-    target: Pose
-    scale: float
+    def __init__(self, hand: Pose, target: Pose, scale: float) -> None:
+        self.scale = scale
+        self._hand, self._target = hand.position, target.position
+        self._hand_from_target = multiply_quaternions(hand.wxyz * CONJUGATE, target.wxyz)
 
     def target_for(self, hand: Pose) -> Pose:
-        turn = multiply_quaternions(hand.wxyz, self.hand.wxyz * CONJUGATE)
-        wxyz = multiply_quaternions(turn, self.target.wxyz)
-        position = self.target.position + self.scale * (hand.position - self.hand.position)
-        return Pose(position, wxyz / math.sqrt(float(wxyz @ wxyz)))
+        wxyz = multiply_quaternions(hand.wxyz, self._hand_from_target)
+        position = self._target + self.scale * (hand.position - self._hand)
+        return Pose(position, wxyz / math.hypot(*wxyz.tolist()))
 
 
 class Fader:
@@ -115,15 +113,15 @@ def seen_from(pose: Pose, yaw: float) -> Pose:
     """A pose of the room in axes turned by `yaw` [rad] about z: x is where somebody faces."""
     c, s = math.cos(yaw), math.sin(yaw)
     x, y, z = pose.position.tolist()
-    back = np.array([math.cos(yaw / 2), 0.0, 0.0, -math.sin(yaw / 2)])
-    wxyz = multiply_quaternions(back, pose.wxyz)
+    w, i, j, k = pose.wxyz.tolist()
+    ch, sh = math.cos(yaw / 2), math.sin(yaw / 2)
+    wxyz = np.array([ch * w + sh * k, ch * i + sh * j, ch * j - sh * i, ch * k - sh * w])
     return Pose(np.array([c * x + s * y, c * y - s * x, z]), wxyz)
 
 
 def _jump(before: Pose, now: Pose, dt: float) -> str:
     """What is wrong with going from one sample to the next in `dt` [s]; empty where nothing is."""
-    moved = now.position - before.position
-    way = math.sqrt(float(moved @ moved))
+    way = math.dist(before.position.tolist(), now.position.tolist())
     turn = 2.0 * math.acos(min(1.0, abs(float(before.wxyz @ now.wxyz))))
     if way <= max(MAX_JUMP, MAX_SPEED * dt) and turn <= max(MAX_TURN, MAX_TURN_RATE * dt):
         return ""  # NaN gets no further

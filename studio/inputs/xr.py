@@ -124,11 +124,10 @@ def decode(text: str | bytes) -> XrMessage:
 def pose_of(xr: Sequence[float]) -> Pose:
     """In our axes. Raises ValueError where the quaternion is none."""
     x, y, z, qx, qy, qz, qw = xr
-    wxyz = np.array([qw, -qz, -qx, qy])
-    norm = math.sqrt(float(wxyz @ wxyz))
+    norm = math.hypot(qx, qy, qz, qw)
     if not 0.9 < norm < 1.1:  # browsers send single precision
         raise ValueError(f"A quaternion with norm {norm:.3g}; a pose needs a unit quaternion.")
-    return Pose(np.array([-z, -x, y]), wxyz / norm)
+    return Pose(np.array([-z, -x, y]), np.array([qw / norm, -qz / norm, -qx / norm, qy / norm]))
 
 
 def pose_of_matrix(xr: Array) -> Pose:
