@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,7 @@ from studio.catalog import Catalog
 from studio.episode import Episode, open_episode
 from studio.index import EpisodeRow, Filters
 from studio.recorder import versions
+from studio.references import REFERENCES
 
 if TYPE_CHECKING:
     from policy.train import TrainResult
@@ -72,6 +74,7 @@ class Run:
     config: TrainConfig
     takes: tuple[Chosen, ...]
     done: int = 0  # steps
+    rollouts: tuple[str, ...] = ()  # takes of a new run that are no demonstrations, but were asked for
 
     @property
     def is_begun(self) -> bool:
@@ -90,18 +93,23 @@ def prepare(
 ) -> Run:
     """A new run of successful demonstrations of a task, or of those that `filters` ask for.
 
-    `episodes` takes the first so many recorded. A `collection` tells the takes instead: all of them, as they
-    were annotated when it was made. Raises ValueError where none matches, or one is of another task.
+    What a policy drove, all of it or a part, counts only where `filters` ask for that agent, or for
+    evaluations. `episodes` takes the first so many recorded. A `collection` tells the takes instead: all of
+    them, as they were annotated when it was made. Raises ValueError where none matches, or one is of another
+    task.
     """
     name = name or f"{task}-{config.policy}-{time.strftime('%Y%m%d-%H%M%S')}"
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r} cannot name a run; use letters, digits, - _ .")
+    if name in REFERENCES or name in DEMONSTRATORS:
+        raise ValueError(f"{name!r} cannot name a run: takes and evaluations know another agent by it.")
     folder = catalog.data_dir / "runs" / name
     if folder.exists() and leads():
         raise ValueError(f"There is a run {name} already; resume it, or give another name.")
     rows = choose(catalog, task, episodes=episodes, filters=filters, collection=collection)
     takes = tuple(Chosen(row.episode_id, row.trim, row.edit_version) for row in rows)
-    return Run(folder, task, config, takes)
+    rollouts = tuple(row.episode_id for row in rows if not is_demonstration(row))
+    return Run(folder, task, config, takes, rollouts=rollouts)
 
 
 def choose(
@@ -318,19 +326,25 @@ def _named(catalog: Catalog, task: str, name: str, filters: Filters | None) -> l
 
 
 def _select(catalog: Catalog, filters: Filters) -> list[EpisodeRow]:
-    """Those that match, as they were recorded; what a policy drove only where it is asked for."""
+    """Those that match, as they were recorded; other than demonstrations only where they are asked for."""
     rows = catalog.episodes(sort="started", descending=False, limit=None, **filters)
-    if filters.get("operator") or filters.get("agent"):
+    agent = filters.get("agent")
+    if filters.get("operator") == EVALUATION or (agent is not None and agent not in DEMONSTRATORS):
         return rows
-    return [row for row in rows if row.operator != EVALUATION and not _is_of_policy(row)]
+    return [row for row in rows if is_demonstration(row)]
 
 
-def _is_of_policy(row: EpisodeRow) -> bool:
-    """Whether a policy drove it on the page."""
-    if row.agent in DEMONSTRATORS:
-        return False
-    with open_episode(row.path) as episode:
-        return "run" in episode.header.provenance
+def is_demonstration(row: EpisodeRow) -> bool:
+    """Whether a take is no rollout, and no policy drove any part of it."""
+    return row.operator != EVALUATION and not _has_policy(row.path)
+
+
+@lru_cache(maxsize=100_000)
+def _has_policy(path: Path) -> bool:
+    """Whether a policy began the recording or was handed over to; recordings never change."""
+    with open_episode(path) as episode:
+        handed = (event.text for event in episode.events() if event.kind == "driver")
+        return "run" in episode.header.provenance or any(text.startswith("policy ") for text in handed)
 
 
 def _why_none(catalog: Catalog, task: str, filters: Filters) -> str:

@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ from policy.config import TrainConfig
 from studio import training
 from studio.__main__ import main
 from studio.api import DemoReport, Studio
-from studio.benchmarks.episodes import made_up_header, write_take
+from studio.benchmarks.episodes import made_up_header, made_up_steps
+from studio.episode import Outcome
 from studio.index import Filters
 from studio.inputs.policy import Immediate, PolicyAgent
+from studio.recorder import Recorder
 from studio.session import Session
 from studio.training import Chosen, recording_of
 from studio.twin import Twin
@@ -96,15 +99,51 @@ def test_a_rollout_is_no_demonstration(data: Path) -> None:
         )
 
 
-def test_what_a_policy_drove_on_the_page_is_no_demonstration(tmp_path: Path) -> None:
+def made_up_take(data: Path, agent: str, operator: str, driven_by: str = "", **provenance: str) -> None:
+    """A take of 0.1 s, in the middle of which somebody else may begin to drive."""
+    header = dataclasses.replace(made_up_header(), agent=agent, operator=operator, provenance=provenance)
+    with Recorder(data).start(header, realtime=False) as take:
+        for number, step in enumerate(made_up_steps(10, header)):
+            take.on_step(step)
+            if number == 5 and driven_by:
+                take.add_event("driver", driven_by)
+        take.finish(Outcome(None, "made up"))
+
+
+def test_what_a_policy_drove_is_a_demonstration_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    made_up_take(tmp_path, "operator", "ana")
+    made_up_take(tmp_path, "operator", "ana", driven_by="nobody")
+    made_up_take(tmp_path, "operator", "bob", driven_by="policy learner")  # handed over in its middle
+    made_up_take(tmp_path, "learner", "ana", run="learner")  # sat beside it
+    made_up_take(tmp_path, "learner", "bob", driven_by="operator bob", run="learner")  # took over from it
+    made_up_take(tmp_path, "learner", training.EVALUATION, run="learner", evaluation="e")
+    made_up_take(tmp_path, "imported", "carl")
     with Studio(tmp_path) as studio:
-        for agent, provenance in {"operator": {}, "learner": {"run": "learner"}, "imported": {}}.items():
-            header = dataclasses.replace(made_up_header(), agent=agent, provenance=provenance)
-            write_take(tmp_path / "episodes" / "made-up" / f"{header.episode_id}.mcap", header, 0.1)
-        found = training.choose(studio.catalog, "made-up", filters={"outcome": "unmarked"})
-        assert {row.agent for row in found} == {"operator", "imported"}
-        asked: Filters = {"outcome": "unmarked", "agent": "learner"}
-        assert [row.agent for row in training.choose(studio.catalog, "made-up", filters=asked)] == ["learner"]
+
+        def who(**asked: Unpack[Filters]) -> list[tuple[str, str]]:
+            filters: Filters = {"outcome": "unmarked", **asked}
+            rows = training.choose(studio.catalog, "made-up", filters=filters)
+            return sorted((row.agent, row.operator) for row in rows)
+
+        ana = [("operator", "ana")] * 2
+        learner = [("learner", name) for name in ("ana", "bob", "evaluation")]
+        assert who() == [("imported", "carl"), *ana]
+        assert who(operator="ana") == who(agent="operator") == ana
+        with pytest.raises(ValueError, match="none has"):
+            who(operator="bob")
+        assert who(agent="learner") == learner
+        assert who(operator=training.EVALUATION) == learner[2:]
+        everything = [row.episode_id for row in studio.episodes()]
+        studio.make_collection("all", episode_ids=everything)
+        run = training.prepare(studio.catalog, "made-up", QUICK, name="a", collection="all")
+        assert (len(run.takes), len(run.rollouts)) == (7, 4)  # of which whoever trains is told
+
+
+def test_a_run_is_not_named_like_another_agent(data: Path) -> None:
+    with Studio(data) as studio:
+        for name in ("operator", "demonstrator", "replay"):
+            with pytest.raises(ValueError, match="know another agent by it"):
+                studio.begin_run("wiping", QUICK, name)
 
 
 def test_only_what_is_asked_for_is_learned_from(data: Path) -> None:

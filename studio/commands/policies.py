@@ -73,6 +73,9 @@ def train(
             if resume
             else studio.begin_run(task, config, name, episodes, filters, collection)
         )
+        if run.rollouts and not quiet:
+            told = f"{len(run.rollouts)} of {len(run.takes)} takes are no demonstrations: a policy drove."
+            errors.print(told, style="yellow")
         total = run.config.steps - run.done
         file = ProgressFile(progress_file if training.leads() else None, run.config.steps, run.done)
         with progress(f"{run.folder.name}, {len(run.takes)} takes", total, quiet=quiet) as advance:
