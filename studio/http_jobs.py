@@ -152,6 +152,7 @@ class DemoIn(Asked):
     seed: Seed = 0
     workers: Workers = 1
     cameras: bool = True
+    spread: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
 
     def request(self, studio: Studio, where: Where) -> Request:
         return plans.demo(
@@ -162,6 +163,7 @@ class DemoIn(Asked):
             seed=self.seed,
             workers=self.workers,
             cameras=self.cameras,
+            spread=self.spread,
         )
 
 

@@ -173,7 +173,7 @@ def test_the_form_says_what_the_command_line_says() -> None:
     assert properties.keys() == {field.name for field in dataclasses.fields(TrainConfig)}
     for name, field in properties.items():
         assert field["flag"] in words or f"--no-{field['flag'][2:]}" in words
-        assert " ".join(field["description"].split()) in words
+        assert " ".join(field["description"].lower().split()) in words.lower()
         assert field["default"] == getattr(PRESETS["small"], name)
     assert (properties["lr"]["group"], properties["lr"]["title"]) == ("Optimisation", "Learning rate")
     assert (properties["chunk_seconds"]["unit"], properties["chunk_seconds"]["flag"]) == (

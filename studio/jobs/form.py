@@ -47,11 +47,12 @@ def _words(name: str, told: str) -> dict[str, str]:
     """How people read a field."""
     title = " ".join(WORDS.get(part, part) for part in name.split("_"))
     unit = _UNIT.match(told)
+    rest = told[unit.end() :] if unit else ""
     return {
         "title": title[0].upper() + title[1:],
         "flag": f"--{name.replace('_', '-')}",
         "unit": unit[1] if unit else "",
-        "description": told[unit.end() :] if unit else told,
+        "description": rest[:1].upper() + rest[1:] if unit else told,
     }
 
 

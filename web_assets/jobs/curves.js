@@ -35,13 +35,13 @@ export class Chart {
     this.plot = new uPlot({
       ...this.size(),
       scales: { x: { time: false }, y: { distr: this.isLog ? 3 : 1, range: (_, low, high) => (this.isLog ? decades(low, high) : spread(low, high)) } },
-      axes: [{ ...AXIS, size: 28 }, { ...AXIS, values: (_, ticks) => ticks.map((v) => (v === null ? "" : short(v))) }],
+      axes: [{ ...AXIS, size: 28 }, { ...AXIS, values: (_, ticks) => ticks.map((v) => (v === null || (this.isLog && !isRound(v)) ? "" : short(v))) }],
       series: [{ label: "step" }, ...drawn.map(({ label, color, isDashed, hasPoints }) => ({
         label, stroke: color, width: isDashed ? 1 : 1.6, dash: isDashed ? [4, 3] : undefined, spanGaps: true,
         points: { show: !!hasPoints, size: 5, fill: color }, value: (_, v) => (v === null || v === undefined ? "–" : short(v)),
       }))],
       cursor: { sync: { key: "steps" }, drag: { x: true, y: false } },
-      legend: { live: true },
+      legend: { live: true, markers: { dash: (_, n) => (drawn[n - 1]?.isDashed ? "dashed" : "solid") } },
     }, data, this.box);
   }
 
@@ -63,6 +63,9 @@ function decades(low, high) {
   const margin = Math.max(1.15, Math.sqrt(3 / (high / low)));
   return [low / margin, high * margin];
 }
+
+// Not the end of a logarithmic scale, which may be any number.
+const isRound = (v) => Math.abs(Number(v.toPrecision(1)) / v - 1) < 1e-9;
 
 function short(v) {
   const size = Math.abs(v);

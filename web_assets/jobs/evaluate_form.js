@@ -2,7 +2,8 @@
 
 import { api } from "../dataset/api.js";
 import { attempt, h, toast } from "../dataset/dom.js";
-import { field, numberOf, select, setOptions } from "./fields.js";
+import { author, field, numberOf, select, setOptions } from "./fields.js";
+import { Place } from "./place.js";
 
 const REFERENCES = ["demonstrator", "nothing", "average", "replay", "all-low", "all-high", "off-compliant", "off-joint"];
 
@@ -23,6 +24,7 @@ export class EvaluateForm {
     this.hidden = h("details", {}, h("summary", {}, "Execution, and what is hidden from it"),
       field("Execution", this.execution), field("Spread", this.spread, "Above 1 widens the task's randomisation."),
       ...this.hide.map((box) => field(`Hide ${box.value}`, box)), field("Record images", this.cameras, "Although the agent needs none."));
+    this.place = new Place();
     this.taskField = field("Task", this.task);
     this.whichField = field("Checkpoint", this.which);
     this.button = h("button", { class: "main", type: "submit" }, "Start evaluation");
@@ -31,7 +33,7 @@ export class EvaluateForm {
       h("h2", {}, "Scenes"),
       h("div", { class: "pairs" }, field("First seed", this.seed), field("How many", this.episodes)),
       field("Workers", this.workers, "Processes that roll out side by side."),
-      this.hidden,
+      this.hidden, this.place.element,
       h("p", { class: "count" }, "Two evaluations on the same seeds meet the same scenes, and can be compared pair by pair."),
       h("div", { class: "buttons" }, this.button));
   }
@@ -65,7 +67,7 @@ export class EvaluateForm {
 
   async start() {
     const body = {
-      kind: "evaluate", agent: this.agent.value, author: localStorage.getItem("studio.author") || "page",
+      kind: "evaluate", agent: this.agent.value, author: author(), ...this.place.read(),
       seed: numberOf("First seed", this.seed.value), episodes: numberOf("How many", this.episodes.value), workers: numberOf("Workers", this.workers.value),
       execution: this.execution.value, spread: numberOf("Spread", this.spread.value), cameras: this.cameras.checked,
     };
@@ -79,13 +81,15 @@ export class EvaluateForm {
     }
   }
 
-  fill({ settings }) {
+  fill(job) {
+    const { settings } = job;
     this.agent.value = settings.agent;
     this.chosen();
     this.task.value = settings.task;
     for (const name of ["which", "seed", "episodes", "workers", "execution", "spread"]) this[name].value = settings[name];
     for (const box of this.hide) box.checked = settings.hide.includes(box.value);
     this.cameras.checked = settings.cameras;
+    this.place.write(job);
     toast("The form has the settings of that evaluation; change them and start.");
   }
 }

@@ -4,12 +4,13 @@ import { h } from "../dataset/dom.js";
 
 let numbers = 0;
 
-// A label before what it names; `help` is told below it.
-export function field(label, control, help = "") {
+// A label before what it names; `help` is told below it, `flag` is its name on the command line.
+export function field(label, control, help = "", flag = "") {
   control.id ||= `field-${(numbers += 1)}`;
   const text = help && h("small", { id: `${control.id}-help` }, help);
   if (text) control.setAttribute("aria-describedby", text.id);
-  return h("div", { class: control.type === "checkbox" ? "field check" : "field" }, h("label", { for: control.id }, label), control, text);
+  const name = h("span", { class: "name" }, h("label", { for: control.id }, label), flag && h("code", { title: "On the command line" }, flag));
+  return h("div", { class: control.type === "checkbox" ? "field check" : "field" }, name, control, text);
 }
 
 // options: [[value, text], …]
@@ -28,28 +29,33 @@ export function setOptions(control, options) {
   if (options.some(([value]) => value === before)) control.value = before;
 }
 
-const words = (name) => name.replaceAll("_", " ").replace(/^./, (letter) => letter.toUpperCase());
+const titles = new Map(); // of the settings of training, by their names
 
-// Of one property of a JSON schema: {label, element, read(): value, write(value)}.
+export const titleOf = (name) => titles.get(name) ?? name.replaceAll("_", " ");
+
+// Of one property of a JSON schema: {element, read(): value, write(value)}.
 export function fieldOf(name, property) {
   const types = property.anyOf?.map((part) => part.type) ?? [property.type];
   const isOptional = types.includes("null");
+  const { title, unit, flag, description } = property;
+  titles.set(name, title);
+  const labelled = (control) => field(title + (unit && ` [${unit}]`), control, description, flag);
   if (property.enum) {
     const control = select(name, property.enum.map((value) => [value, value]));
-    return { element: field(words(name), control, property.description), read: () => control.value, write: (value) => { control.value = value; } };
+    return { element: labelled(control), read: () => control.value, write: (value) => { control.value = value; } };
   }
   if (types.includes("boolean")) {
     const control = h("input", { type: "checkbox", name });
-    return { element: field(words(name), control, property.description), read: () => control.checked, write: (value) => { control.checked = value; } };
+    return { element: labelled(control), read: () => control.checked, write: (value) => { control.checked = value; } };
   }
   const isNumber = types.includes("number") || types.includes("integer");
-  const control = h("input", { type: "text", name, inputmode: isNumber ? "decimal" : "text", placeholder: isOptional ? "as above" : "", spellcheck: false });
+  const control = h("input", { type: "text", name, inputmode: isNumber ? "decimal" : "text", placeholder: isOptional ? "not given" : "", spellcheck: false });
   const read = () => {
     const text = control.value.trim();
     if (text === "" && isOptional) return null;
-    return isNumber ? numberOf(words(name), text) : text;
+    return isNumber ? numberOf(title, text) : text;
   };
-  return { element: field(words(name), control, property.description), read, write: (value) => { control.value = value ?? ""; } };
+  return { element: labelled(control), read, write: (value) => { control.value = value ?? ""; } };
 }
 
 export function numberOf(label, text) {
@@ -57,6 +63,9 @@ export function numberOf(label, text) {
   if (text.trim() === "" || !Number.isFinite(value)) throw new Error(`${label} must be a number, not “${text}”.`);
   return value;
 }
+
+// The name under which a person asks, as on the dataset page.
+export const author = () => localStorage.getItem("studio.author") || "page";
 
 // The address of another page of ours; beside the 3-D view it stays beside it.
 export function link(path, query = {}) {

@@ -3,9 +3,11 @@
 import { api } from "../dataset/api.js";
 import { attempt, h, toast } from "../dataset/dom.js";
 import { date, exactDate } from "../dataset/format.js";
-import { duration } from "./fields.js";
+import { duration, titleOf } from "./fields.js";
+import { placeOf } from "./place.js";
 
 const ACTIVE = ["queued", "running", "lost"];
+const KINDS = { demo: ["demo"], train: ["train", "export"], evaluate: ["evaluate"] }; // that each view lists, besides what runs
 const SIGNS = { queued: "◷", running: "▶", done: "✓", failed: "✗", cancelled: "–", interrupted: "!", lost: "?" };
 
 export class JobList {
@@ -21,11 +23,12 @@ export class JobList {
     const told = JSON.stringify([view, jobs, runs.map((run) => [run.name, run.step, run.best]), evaluations.length, chosen]);
     if (told === this.told) return;
     this.told = told;
-    const isOf = ({ job, standing }) => ACTIVE.includes(standing.state) || job.job_id === chosen.job || (view === "evaluate") === (job.kind === "evaluate");
+    const isOf = ({ job, standing }) => ACTIVE.includes(standing.state) || job.job_id === chosen.job || KINDS[view].includes(job.kind);
     jobs = jobs.filter(isOf);
     const focused = document.activeElement?.dataset.key;
     this.jobs.replaceChildren(...(jobs.length ? jobs.map((now) => this.row(now, chosen)) : [h("p", { class: "dim" }, "Nothing was asked for yet.")]));
-    this.results.replaceChildren(...(view === "train" ? this.runsOf(runs, jobs, chosen) : this.evaluationsOf(evaluations, chosen)));
+    const results = { demo: () => [], train: () => this.runsOf(runs, jobs, chosen), evaluate: () => this.evaluationsOf(evaluations, chosen) };
+    this.results.replaceChildren(...results[view]());
     if (focused) document.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   }
 
@@ -36,7 +39,7 @@ export class JobList {
       h("button", { class: "name", "data-key": job.job_id, "aria-current": isHere ? "true" : null, onclick: () => this.act.open(now) },
         h("i", { "aria-hidden": "true" }, SIGNS[standing.state]), h("b", {}, job.title), sweptOf(job)),
       h("span", { class: "state", title: standing.why }, standing.state),
-      h("span", { class: "when", title: exactDate(job.created) }, `${date(job.created)} · ${job.author}`),
+      h("span", { class: "when", title: exactDate(job.created) }, `${date(job.created)} · ${job.author} · ${placeOf(job)}`),
       progressOf(now),
       standing.why && h("p", { class: "why" }, standing.why),
       h("div", { class: "acts" }, this.actsOf(now)));
@@ -49,7 +52,7 @@ export class JobList {
     return [
       isActive && h("button", { onclick: post("cancel", job.kind === "train" && standing.state === "running" ? "It saves a checkpoint, then ends." : null) }, "Cancel"),
       !isActive && standing.state !== "done" && h("button", { onclick: post("resume") }, job.kind === "train" ? "Resume" : "Again"),
-      ["train", "evaluate"].includes(job.kind) && h("button", { onclick: () => this.act.again(now) }, "Duplicate…"),
+      job.kind !== "export" && h("button", { onclick: () => this.act.again(now) }, "Duplicate…"),
       job.kind === "train" && job.sweep && h("button", { title: "The curves of all runs of this sweep", onclick: () => this.act.openSweep(job.sweep) }, "Compare"),
       !isActive && h("button", { class: "danger", onclick: () => attempt(() => this.remove(job)) }, "Delete"),
     ];
@@ -100,7 +103,7 @@ export class JobList {
 
 export const interval = ([low, high]) => `${Math.round(100 * low)}–${Math.round(100 * high)} %`;
 
-const sweptOf = ({ swept }) => Object.entries(swept).map(([name, value]) => h("span", { class: "tag" }, `${name.replaceAll("_", " ")} ${value}`));
+const sweptOf = ({ swept }) => Object.entries(swept).flatMap(([name, value]) => [" ", h("span", { class: "tag" }, `${titleOf(name)} ${value}`)]);
 
 const WHAT = { train: "steps", evaluate: "rollouts", demo: "takes", export: "%" };
 

@@ -1,9 +1,10 @@
-// The page of jobs: train and evaluate, what runs, and what came of it.
+// The page of jobs: demonstrate, train and evaluate, what runs, and what came of it.
 //
 // /train?tab=evaluate&job=ID&run=NAME&run=NAME&evaluation=ID&against=ID  shows the same again.
 
 import { api } from "../dataset/api.js";
 import { attempt, h } from "../dataset/dom.js";
+import { DemoForm } from "./demo_form.js";
 import { EvaluateForm } from "./evaluate_form.js";
 import { EvaluationView } from "./evaluation_view.js";
 import { link } from "./fields.js";
@@ -13,7 +14,7 @@ import { TrainForm } from "./train_form.js";
 
 const PERIOD = 1000; // [ms] between two looks; the studio answers 304 where nothing changed
 const SELDOM = 10; // looks after which runs and evaluations are asked for, too: others make some
-const VIEWS = { train: "Train", evaluate: "Evaluate" };
+const VIEWS = { demo: "Demonstrate", train: "Train", evaluate: "Evaluate" };
 
 const at = (id) => document.getElementById(id);
 const page = { view: "train", job: null, runs: [], evaluation: null, against: null };
@@ -27,9 +28,12 @@ const list = new JobList(at("jobs"), {
   again: (job) => again(job),
   changed: () => look(true),
 });
-const trainForm = new TrainForm({ started: (job) => started(job) });
-const evaluateForm = new EvaluateForm({ started: (job) => started(job) });
-const runView = new RunView(at("closer"), { evaluate: (name) => { go({ view: "evaluate" }); evaluateForm.choose(name); } });
+const forms = {
+  demo: new DemoForm({ started }),
+  train: new TrainForm({ started, demonstrate: (task) => { go({ view: "demo" }); forms.demo.choose(task); } }),
+  evaluate: new EvaluateForm({ started }),
+};
+const runView = new RunView(at("closer"), { evaluate: (name) => { go({ view: "evaluate" }); forms.evaluate.choose(name); } });
 const evaluationView = new EvaluationView(at("closer"), { against: (id) => go({ against: id }) });
 
 const toggled = (names, name) => (names.includes(name) ? names.filter((other) => other !== name) : [...names, name]);
@@ -42,9 +46,8 @@ function started(job) {
 
 // The form as that job was asked for, to ask again with changes.
 function again(job) {
-  const view = job.job.kind === "evaluate" ? "evaluate" : "train";
-  go({ view });
-  (view === "train" ? trainForm : evaluateForm).fill(job.job);
+  go({ view: job.job.kind });
+  forms[job.job.kind].fill(job.job);
 }
 
 function go(changes) {
@@ -61,7 +64,7 @@ function go(changes) {
 
 function show() {
   for (const link of document.querySelectorAll("#top [data-view]")) link.classList.toggle("here", link.dataset.view === page.view);
-  const form = page.view === "train" ? trainForm : evaluateForm;
+  const form = forms[page.view];
   if (at("ask").firstChild !== form.element) at("ask").replaceChildren(form.element);
   form.tell({ runs, evaluations });
   list.show({ view: page.view, jobs, runs, evaluations, chosen: page });
@@ -120,6 +123,6 @@ go({
   evaluation: given.get("evaluation"),
   against: given.get("against"),
 });
-if (given.get("collection")) trainForm.chooseCollection(given.get("collection"));
-attempt(() => Promise.all([trainForm.load(), evaluateForm.load()])).then(keepLooking);
+if (given.get("collection")) forms.train.chooseCollection(given.get("collection"));
+attempt(() => Promise.all(Object.values(forms).map((form) => form.load()))).then(keepLooking);
 document.addEventListener("visibilitychange", () => { if (!document.hidden) attempt(() => look(true)); });

@@ -4,8 +4,9 @@ import { api } from "../dataset/api.js";
 import { attempt, h } from "../dataset/dom.js";
 import { exactDate } from "../dataset/format.js";
 import { Chart, COLORS } from "./curves.js";
-import { link } from "./fields.js";
+import { link, titleOf } from "./fields.js";
 import { progressOf } from "./job_list.js";
+import { placeOf } from "./place.js";
 
 const GROUPS = ["position", "rotation", "gripper", "stiffness", "joints", "kl"];
 const ERRORS = { position_mm: "mm", rotation_deg: "°", joints_deg: "°", stiffness_N_per_m: "N/m" };
@@ -116,13 +117,20 @@ export class RunView {
         run?.checkpoints.length ? h("a", { href: "/", target: "_top", title: "Choose the run as the driver on the studio's first page." }, "Drive with it") : null),
       job ? h("p", { class: "line" }, h("span", { class: `badge ${job.standing.state}` }, job.standing.state), progressOf(job)) : null,
       run?.problem ? h("p", { class: "why" }, run.problem) : null,
-      run ? chain(run) : job ? h("p", { class: "dim" }, `studio ${job.job.command.join(" ")}`) : null,
+      run ? chain(run) : job ? asked(job) : null,
       damaged(this.metrics.get(names[0])),
     ].filter(Boolean);
   }
 }
 
 const damaged = (metrics) => (metrics?.damaged ? h("p", { class: "why" }, `${metrics.damaged} damaged ${metrics.damaged === 1 ? "line" : "lines"} in metrics.jsonl are left out.`) : null);
+
+// What a job other than training does, and where to find what came of it.
+function asked({ job, progress }) {
+  const query = { task: job.subject, agent: "scripted" };
+  return h("div", {}, h("p", { class: "dim" }, h("code", {}, `studio ${job.command.join(" ")}`), ` on ${placeOf(job)}`),
+    job.kind === "demo" && progress?.done > 0 ? h("p", {}, h("a", { href: link("/dataset", query) }, "Look at the takes")) : null);
+}
 
 // Where a run comes from: takes -> code -> machine -> seed.
 function chain(run) {
@@ -135,7 +143,7 @@ function chain(run) {
     h("dt", {}, "Learned from"), h("dd", {}, `${run.takes.length} takes of `, takes, h("details", {}, h("summary", {}, "which"), h("ul", {}, run.takes.map((take) => h("li", {},
       h("a", { href: link("/dataset", { episode: take.episode_id }) }, take.episode_id), h("small", { class: "dim" }, take.edit_version ? ` edit ${take.edit_version}` : "")))))),
     h("dt", {}, "Settings"), h("dd", {}, `${config.policy}, ${config.preset}, ${config.images ? "images" : "no images"}, ${config.wrench ? "F/T" : "no F/T"}, seed ${config.seed}`,
-      h("details", {}, h("summary", {}, "all"), h("ul", {}, Object.entries(config).map(([name, value]) => h("li", {}, `${name.replaceAll("_", " ")} `, h("b", {}, String(value))))))),
+      h("details", {}, h("summary", {}, "all"), h("ul", {}, Object.entries(config).map(([name, value]) => h("li", {}, `${titleOf(name)} `, h("b", {}, String(value))))))),
     code && [h("dt", {}, "Code"), h("dd", {}, code)],
     origin.machine && [h("dt", {}, "Begun on"), h("dd", {}, `${origin.machine.name}, ${origin.machine.cores} cores${origin.created ? `, ${exactDate(origin.created)}` : ""}${origin.author ? `, by ${origin.author}` : ""}`)],
     h("dt", {}, "Checkpoints"), h("dd", {}, run.checkpoints.length ? `step ${run.step} of ${run.steps}` : "none yet"));
@@ -146,7 +154,7 @@ function compared(names, runs) {
   const found = names.map((name) => runs.find((run) => run.name === name)).filter(Boolean);
   const differs = [...new Set(found.flatMap((run) => Object.keys(run.config)))].filter((field) => new Set(found.map((run) => JSON.stringify(run.config[field]))).size > 1);
   return h("div", { class: "scroll" }, h("table", {},
-    h("thead", {}, h("tr", {}, h("th", {}, "Run"), differs.map((field) => h("th", {}, field.replaceAll("_", " "))), h("th", {}, "Step"), h("th", {}, "Best on others"))),
+    h("thead", {}, h("tr", {}, h("th", {}, "Run"), differs.map((field) => h("th", {}, titleOf(field))), h("th", {}, "Step"), h("th", {}, "Best on others"))),
     h("tbody", {}, found.map((run, n) => h("tr", {},
       h("td", {}, h("i", { class: "swatch", style: { background: COLORS[n % COLORS.length] } }), run.name),
       differs.map((field) => h("td", { class: "number" }, String(run.config[field]))),

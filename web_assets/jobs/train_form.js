@@ -2,15 +2,17 @@
 
 import { api } from "../dataset/api.js";
 import { attempt, h, toast } from "../dataset/dom.js";
-import { duration, field, fieldOf, numberOf, select, setOptions } from "./fields.js";
+import { author, duration, field, fieldOf, numberOf, select, setOptions } from "./fields.js";
+import { Place } from "./place.js";
 
 const FIRST = ["preset", "policy", "images", "wrench", "steps"]; // the rest is folded away by its headings
 const EXAMINED = 1000; // takes at most, whose health is told
 const PAUSE = 250; // [ms] after the last change before takes are counted again
 
 export class TrainForm {
-  constructor({ started }) {
-    this.started = started;
+  // `demonstrate(task)` leads to where takes of a task are made.
+  constructor({ started, demonstrate }) {
+    Object.assign(this, { started, demonstrate });
     this.fields = {};
     this.task = select("task", [], () => this.chosen());
     this.source = select("source", [["filter", "Successful takes that match"], ["collection", "A collection"]], () => this.chosen());
@@ -20,8 +22,7 @@ export class TrainForm {
     this.quality = select("min_quality", [["", "any"], ...[1, 2, 3, 4, 5].map((n) => [n, `${n} or better`])], () => this.chosen());
     this.first = h("input", { type: "text", name: "episodes", inputmode: "numeric", placeholder: "all" });
     this.name = h("input", { type: "text", name: "name", placeholder: "task, policy and time", spellcheck: false });
-    this.processes = h("input", { type: "text", name: "processes", inputmode: "numeric", value: "1" });
-    this.threads = h("input", { type: "text", name: "job_threads", inputmode: "numeric", value: "0" });
+    this.place = new Place({ processes: true });
     this.sweepBy = select("sweep", [["", "no sweep"]], () => { this.sweepValues.hidden = !this.sweepBy.value; });
     this.sweepValues = h("input", { type: "text", name: "sweep_values", placeholder: "values, e.g. 1e-4, 5e-4", hidden: true });
     this.count = h("p", { class: "count", role: "status" });
@@ -33,15 +34,9 @@ export class TrainForm {
     this.element = h("form", { onsubmit: (event) => { event.preventDefault(); attempt(() => this.start()); } },
       h("h2", {}, "Takes"), field("Task", this.task), field("From", this.source), this.byCollection, this.byFilter, this.count,
       h("h2", {}, "Policy"), this.settings,
-      h("h2", {}, "Run"), field("Name", this.name), field("Sweep over", this.sweepBy), this.sweepValues, this.machine(),
+      h("h2", {}, "Run"), field("Name", this.name), field("Sweep over", this.sweepBy), this.sweepValues, this.place.element,
       this.time,
       h("div", { class: "buttons" }, h("button", { type: "button", onclick: () => attempt(() => this.estimate()) }, "Estimate time"), this.button));
-  }
-
-  machine() {
-    return h("details", {}, h("summary", {}, "Processes and threads"),
-      field("Processes", this.processes, "That learn together, through torchrun: one for each GPU."),
-      field("Threads", this.threads, "Of the CPU for each process; 0 leaves one core to the live session."));
   }
 
   async load() {
@@ -63,7 +58,7 @@ export class TrainForm {
     this.settings.addEventListener("input", () => { this.time.textContent = ""; });
     this.usePreset("small");
     const sweepable = Object.entries(properties).filter(([name, { enum: values, type }]) => values || type !== "boolean" && !["preset", "device"].includes(name));
-    setOptions(this.sweepBy, [["", "no sweep"], ...sweepable.map(([name]) => [name, name.replaceAll("_", " ")])]);
+    setOptions(this.sweepBy, [["", "no sweep"], ...sweepable.map(([name, { title, flag }]) => [name, `${title} ${flag}`])]);
     setOptions(this.task, tasks.map(({ task }) => [task, task]));
     setOptions(this.collection, collections.map(({ name, members }) => [name, `${name} (${members.length})`]));
     const { task } = await api.get("/facets");
@@ -95,7 +90,7 @@ export class TrainForm {
   }
 
   async counts(isCollection) {
-    if (isCollection && !this.collection.value) return this.says("No collection yet; make one on the Dataset page.");
+    if (isCollection && !this.collection.value) return this.says("No collection yet: select takes on the page Dataset and name them.");
     const filters = this.filters();
     const body = { task: this.task.value, ...(isCollection ? { collection: this.collection.value } : Object.keys(filters).length ? { filters } : {}) };
     if (!isCollection) {
@@ -109,15 +104,17 @@ export class TrainForm {
       rows = await api.post("/train-takes", body);
     } catch (error) {
       if (error.status !== 422) throw error;
-      return this.says(error.message);
+      const task = this.task.value;
+      return this.says(error.message, isCollection ? null : h("button", { type: "button", class: "link", onclick: () => this.demonstrate(task) }, "Demonstrate…"));
     }
     this.tellTakes(rows, null);
     const episode_ids = rows.slice(0, EXAMINED).map(({ episode_id }) => episode_id);
     return this.tellTakes(rows, await api.post("/dataset-health", { episode_ids }));
   }
 
-  says(why) {
-    this.count.textContent = why;
+  // There is nothing to learn from.
+  says(why, more = null) {
+    this.count.replaceChildren(why, ...(more ? [" ", more] : []));
     this.count.title = "";
     this.button.disabled = true;
   }
@@ -146,8 +143,8 @@ export class TrainForm {
 
   body() {
     const body = {
-      kind: "train", task: this.task.value, preset: this.fields.preset.read(), config: this.config(), author: localStorage.getItem("studio.author") || "page",
-      processes: numberOf("Processes", this.processes.value), threads: numberOf("Threads", this.threads.value),
+      kind: "train", task: this.task.value, preset: this.fields.preset.read(), config: this.config(), author: author(),
+      ...this.place.read(),
     };
     if (this.name.value.trim()) body.name = this.name.value.trim();
     if (this.source.value === "collection") return { ...body, collection: this.collection.value };
@@ -188,7 +185,8 @@ export class TrainForm {
   }
 
   // As a job was asked for.
-  fill({ settings, processes, threads }) {
+  fill(job) {
+    const { settings } = job;
     this.task.value = settings.task;
     this.source.value = settings.collection ? "collection" : "filter";
     if (settings.collection) this.collection.value = settings.collection;
@@ -197,8 +195,7 @@ export class TrainForm {
     this.quality.value = settings.min_quality ?? "";
     this.first.value = settings.episodes ?? "";
     for (const [name, value] of Object.entries(settings.config ?? {})) this.fields[name]?.write(value);
-    this.processes.value = processes;
-    this.threads.value = threads;
+    this.place.write(job);
     this.chosen();
     toast("The form has the settings of that run; change them and start.");
   }
