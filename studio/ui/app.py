@@ -210,16 +210,21 @@ class Page:
             self._hear(notice)
         if status is not None:
             self._set_stage(status)
+        now = time.monotonic()
+        is_due = now >= self._words_due
+        if is_due or self._server.get_clients():  # else rarely: who comes finds it recent
+            self._show_frame(status, state)
+        if is_due:
+            self._words_due = now + STATUS_PERIOD
+            self._show_words(status, state)
+
+    def _show_frame(self, status: Status | None, state: State) -> None:
         frame, count = self.remote.frame.get()
         is_new, self._painted = count != self._painted, count
         if self._stage and status and frame and is_new and frame.resets == status.resets:
             self._stage.show(frame, status)
         elif self._stage and state != "open":
             self._stage.lose()
-        now = time.monotonic()
-        if now >= self._words_due:
-            self._words_due = now + STATUS_PERIOD
-            self._show_words(status, state)
 
     def _show_words(self, status: Status | None, state: State) -> None:
         choice = active_choice(status, self._desk.choice) if status else "nobody"
