@@ -495,8 +495,11 @@ def test_a_second_arm_has_rows_and_keys_of_its_own(gui: viser.ViserServer) -> No
     with Visitor(gui.get_port()) as ana:
         ana.button("● High 750 N/m")
         ana.button("Low 250 N/m")
-        tab.set_task(arms[1:])
+        tab.set_task([replace(right, modes=(StiffnessMode.MEDIUM, StiffnessMode.MEDIUM))])
+        tab.show(STATUS)
         wait_for(lambda: ana._find("GuiButtonMessage", "High") is None)
+        ana.button("● Medium 500 N/m")
+        assert ana._find("GuiButtonMessage", "medium") is None  # nor a second one, without its number
 
 
 def test_runs_of_the_task_are_offered_and_one_is_asked_to_drive(gui: viser.ViserServer) -> None:

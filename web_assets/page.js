@@ -1,6 +1,8 @@
-// What viser's page lacks: our style, sounds, and keys that are held down. Runs again after each reconnection.
+// What viser's page lacks: our style, a line at the top, sounds, and keys that are held down. Runs again after each
+// reconnection.
 //
 // The server writes marks into the page's HTML; this script reads them and never calls the server itself:
+//   <div class="told">…</div>   show a copy of this at the top, also while the panel around it is folded up
 //   <i data-sound="12 start">   play the cue "start"; 12 counts, so that each cue plays once
 //   <i data-hold="KeyW KeyS">   these keys press and hold the buttons that follow the mark
 (() => {
@@ -10,6 +12,16 @@
   if (window.studioPage) return;
   window.studioPage = true;
   document.title = "Comp-ACT Studio";
+
+  // The status line, and what lies over the scene
+
+  const status = Object.assign(document.createElement("div"), { id: "status" });
+  document.body.prepend(status);
+  setInterval(() => {
+    const told = document.createElement("div");
+    for (const part of document.querySelectorAll(".told")) told.append(...part.cloneNode(true).childNodes);
+    if (told.innerHTML !== status.innerHTML) status.replaceChildren(...told.childNodes);
+  }, 100);
 
   // Sounds
 

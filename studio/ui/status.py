@@ -32,18 +32,18 @@ CLASS_OF_LEVEL: Mapping[Level, str] = {"ok": "calm", "limited": "limited", "refu
 
 
 class StatusLine:
-    """The line at the top and what lies over the scene."""
+    """The line at the top and what lies over the scene; `web_assets/page.js` puts them there."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        self._line = gui.add_html(line(None, "closed", "gizmo"))
+        self._line = gui.add_html(_told(line(None, "closed", "gizmo")))
         self._over = gui.add_html("")
 
     def show(
         self, status: Status | None, state: State, operator_input: OperatorInput, control: str = ""
     ) -> None:
         """`control`: who may drive, in words."""
-        self._line.content = line(status, state, operator_input, control)
-        self._over.content = over(status, state)
+        self._line.content = _told(line(status, state, operator_input, control))
+        self._over.content = _told(over(status, state))
 
 
 class Sounds:
@@ -81,6 +81,10 @@ _NOTICES: Mapping[NoticeKind, tuple[str, Color, float | None]] = {
 }
 
 
+def _told(html: str) -> str:
+    return f'<div class="told">{html}</div>'
+
+
 def line(status: Status | None, state: State, operator_input: OperatorInput, control: str = "") -> str:
     """The status line as HTML."""
     parts = ['<span class="name"><b>Comp-ACT Studio</b></span>']
@@ -89,7 +93,7 @@ def line(status: Status | None, state: State, operator_input: OperatorInput, con
     if status is None or state != "open":
         parts.append(f'<span class="refused"><b>{_lost_word(status, state)}</b></span>')
         return _bar(parts, [])
-    parts.append(f"<span>{driver(status, operator_input, control)}</span>")
+    parts.append(f'<span class="driver">{driver(status, operator_input, control)}</span>')
     parts += [_arm(arm, status) for arm in status.arms]
     return _bar(parts, [_pace(status), _input(status), _recording(status)])
 
@@ -155,7 +159,7 @@ def _arm(arm: ArmStatus, status: Status) -> str:
     if arm.level == "ok" and (status.driver == "nobody" or (status.driver == "operator" and not arm.engaged)):
         color, word = "dim", "holds"
     return (
-        f'<span>{escape(arm.name)} <span class="chip {escape(arm.mode)}">{mode_words(arm.mode)}</span>'
+        f'<span class="arm">{escape(arm.name)} <span class="chip {escape(arm.mode)}">{mode_words(arm.mode)}</span>'
         f' <span class="{color}">● {word}</span></span>'
     )
 

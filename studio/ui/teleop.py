@@ -174,11 +174,13 @@ class _ArmRows:
         self._touched = 0.0  # [s] monotonic time at which a person last moved the slider
         self._folder = gui.add_folder(f"{setup.name.capitalize()} arm")
         self._shift = "⇧" if is_shifted(arm, n_arms) else ""
+        modes = {mode.value for mode in setup.modes}  # an arm may have but one
         with self._folder:
-            _columns(gui, 2)
+            if len(modes) > 1:
+                _columns(gui, 2)
             self._modes = {
-                mode.value: gui.add_button(mode.value, color=PASSIVE)
-                for mode in sorted(setup.modes, key=lambda mode: ("low", "medium", "high").index(mode.value))
+                mode: gui.add_button(mode, color=PASSIVE)
+                for mode in sorted(modes, key=("low", "medium", "high").index)
             }
             self._gripper = gui.add_slider(
                 "Gripper", 0.0, 1.0, 0.01, 0.0, hint=f"0 closed, 1 open; {self._shift}G switches."

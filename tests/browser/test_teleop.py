@@ -159,4 +159,8 @@ def test_an_operator_touches_the_board_records_and_gets_over_a_crash(page: Page,
     ana.button("Restart session").click()
     ana.wait(lambda: (data / "episodes" / "wiping" / f"{torn}.mcap").exists())
     ana.button("Start take").wait_for()
+
+    page.set_viewport_size({"width": 420, "height": 600})  # a phone: panels are folded up, the line stays
+    expect(page.get_by_text("Contact force")).to_be_hidden()
+    expect(page.locator("#status .rec")).to_be_visible()
     assert served.end() == 0
