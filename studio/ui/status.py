@@ -159,8 +159,9 @@ def _arm(arm: ArmStatus, status: Status) -> str:
     if arm.level == "ok" and (status.driver == "nobody" or (status.driver == "operator" and not arm.engaged)):
         color, word = "dim", "holds"
     return (
-        f'<span class="arm">{escape(arm.name)} <span class="chip {escape(arm.mode)}">{mode_words(arm.mode)}</span>'
-        f' <span class="{color}">● {word}</span></span>'
+        f'<span class="arm">{escape(arm.name)} '
+        f'<span class="chip {escape(arm.mode)}">{mode_words(arm.mode)}</span> '
+        f'<span class="{color}">● {word}</span></span>'
     )
 
 
