@@ -78,13 +78,18 @@ class ChunkExecutor:
     def reset(self, gripper: tuple[float, ...] | None = None) -> None:
         """Forget all chunks; `gripper` is what each hand keeps until the first one."""
         self.late = 0  # ticks for which no chunk had a word, and the last target was held
-        self._idle = Action(tuple(ArmAction(Hold(), g) for g in gripper or (0.0,) * self._n_arms))
+        self._told = Action(tuple(ArmAction(Hold(), g) for g in gripper or (0.0,) * self._n_arms))
         self._newest: ActionChunk | None = None
         self._start = 0.0  # [s] of the first row
         self._sums: Array = np.empty((0, 0))  # (steps, numbers): weighted sums, see `_rows`
         self._weights: Array = np.empty(0)  # (steps,) of these sums
         self._counts: Array = np.empty(0)  # (steps,) chunks in each
         self._signs: list[Array | None] = [None] * self._n_arms  # last quaternion of each arm
+
+    @property
+    def grippers(self) -> tuple[float, ...]:
+        """What each hand was told last."""
+        return tuple(arm.gripper for arm in self._told.arms)
 
     def wants(self, time: float) -> bool:
         """Whether to ask the policy for a chunk now."""
@@ -111,7 +116,7 @@ class ChunkExecutor:
         Past the end of all that is known, the last target is held and counted in `late`.
         """
         if self._newest is None:
-            return self._idle
+            return self._told
         place = (time - self._start) / self._newest.period
         last = len(self._sums) - 1
         if place > last + 1e-6:
@@ -122,7 +127,8 @@ class ChunkExecutor:
         if (share := place - first) > 1e-9:
             row = row + share * (self._mean(first + 1) - row)
         chunk = self._newest
-        return Action(tuple(self._arm(n, part) for n, part in enumerate(np.split(row, len(chunk.arms)))))
+        self._told = Action(tuple(self._arm(n, p) for n, p in enumerate(np.split(row, len(chunk.arms)))))
+        return self._told
 
     def _mean(self, step: int) -> Array:
         return np.asarray(self._sums[step] / self._weights[step])

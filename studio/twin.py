@@ -141,6 +141,11 @@ class Twin:
         """Count time from here, as a take does. Nothing else depends on time."""
         self.data.time = 0.0
 
+    @property
+    def grippers(self) -> tuple[float, ...]:
+        """What each hand is commanded; one that holds a part is measured wider open."""
+        return tuple(arm.servo.gripper for arm in self.arms)
+
     def progress(self) -> Progress:
         """How far the task is."""
         return self.task.progress(self.world)

@@ -22,6 +22,7 @@ from test_live import Stage
 from controller.types import CartesianTarget, Hold, Image
 from policy.agent import ActionChunk, Inputs
 from studio import messages as m
+from studio import tasks
 from studio.api import Studio
 from studio.episode import open_episode
 from studio.inputs.policy import Immediate, PolicyAgent, Thinking
@@ -117,6 +118,24 @@ def test_time_that_begins_anew_begins_a_new_run(twin: Twin) -> None:
     assert [type(target) for target in targets[:6]] == [Hold] * 5 + [CartesianTarget]
     height = listener.steps[0].observation.arms[0].base_from_tcp.position[2]
     assert targets[5].base_from_target.position[2] == pytest.approx(height, abs=0.005)
+
+
+def test_a_hand_that_holds_a_part_does_not_loosen_its_grip() -> None:
+    twin = Twin(tasks.load("peg-cylinder"))
+    twin.reset(3)
+    observation = twin.observe()
+    assert min(arm.gripper for arm in observation.arms) > 0.2  # as far as the parts let the hands close
+    assert twin.grippers == (0.0, 0.0)
+    spec = dataclasses.replace(SPEC, task="peg-cylinder", arms=("left", "right"))
+    agent = PolicyAgent(Immediate(Riser(spec), latency=0.05), grippers=twin.grippers)
+    agent.reset(observation)
+    session, listener = Session(twin), Listener()
+    for _ in range(20):
+        session.tick(agent, [listener])
+    twin.restart_time()  # a take begins
+    for _ in range(3):
+        session.tick(agent, [listener])
+    assert {arm.gripper for step in listener.steps for arm in step.requested.arms} == {0.0}
 
 
 def test_an_answer_to_somebody_before_is_dropped(twin: Twin) -> None:

@@ -126,10 +126,21 @@ class PolicyAgent:
     """Drives with what a mind says."""
 
     def __init__(
-        self, mind: Mind, execution: ExecutionMode = "replan", replan_every: int | None = None, seed: int = 0
+        self,
+        mind: Mind,
+        execution: ExecutionMode = "replan",
+        replan_every: int | None = None,
+        *,
+        seed: int = 0,
+        grippers: tuple[float, ...] | None = None,
     ) -> None:
-        """`replan_every` counts steps of a chunk between two questions, see `ChunkExecutor`."""
+        """`replan_every` counts steps of a chunk between two questions, see `ChunkExecutor`.
+
+        `grippers`: what the hands are commanded now, and stay at until the first answer. Not told, they stay
+        as they are measured, which loosens the grip on what they hold.
+        """
         self._mind, self._seed = mind, seed
+        self._grippers = grippers
         self._history = History(mind.spec)
         self._executor = ChunkExecutor(execution, replan_every, n_arms=len(mind.spec.arms))
         self._time = 0.0  # [s] of the last observation
@@ -148,12 +159,13 @@ class PolicyAgent:
     def reset(self, observation: Observation) -> None:
         self._mind.reset(self._seed)
         self._history.reset()
-        self._executor.reset(tuple(arm.gripper for arm in observation.arms))
+        self._executor.reset(self._grippers or tuple(arm.gripper for arm in observation.arms))
         self._time, self._asked = observation.time, None
 
     def act(self, observation: Observation) -> Action:
         now = observation.time
         if now < self._time:  # a take has begun, and time with it
+            self._grippers = self._executor.grippers
             self.reset(observation)
         self._time = now
         self._history.add(observation)
