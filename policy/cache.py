@@ -34,8 +34,8 @@ def build(
 ) -> None:
     """Write the cache of some takes of one task to `folder`; without `max_size` it has no images.
 
-    Raises ValueError, naming the take, where two differ in task, arms, cameras or rates, where there is
-    nothing in one to learn from, or where it holds numbers that are not finite.
+    Raises ValueError, naming the take, where two differ in task, arms, cameras, rates or stiffness table,
+    where there is nothing in one to learn from, or where it holds numbers that are not finite.
     """
     if not recordings:
         raise ValueError("There is no take to learn from.")
@@ -124,12 +124,17 @@ class _Writer:
             raise ValueError(f"{recording.name} has no images; --no-images learns without.")
         elif len({tuple(size) for size in cameras.values()}) > 1:
             raise ValueError(f"The cameras of {recording.name} differ in size: {cameras}.")
-        found = {"task": recording.task, "arms": list(recording.arms), "recorded": cameras}
+        found = {
+            "task": recording.task,
+            "arms": list(recording.arms),
+            "recorded": cameras,
+            "stiffness_table": recording.stiffness_table,
+        }
         if not self._first:
             self._first = found
         for name, value in found.items():
             if value != self._first[name]:
-                what = "cameras" if name == "recorded" else name
+                what = "cameras" if name == "recorded" else name.replace("_", " ")
                 raise ValueError(
                     f"{recording.name} has {what} {value}, but {self._takes[0]['name']} {self._first[name]}; "
                     "takes of one run must be alike."

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from controller.stiffness import StiffnessTable
 from policy.config import TrainConfig
 from policy.features import Control, Features
 
@@ -39,9 +40,15 @@ class PolicySpec:
     wrench_history: int  # samples of force and torque, 0 for none
     wrench_rate: float  # [Hz] of these samples
     step: int  # of the training
+    stiffness_table: StiffnessTable = "tuned"  # what the controller must be set up for
 
-    def check(self, task: str, arms: Iterable[str], cameras: Iterable[str]) -> None:
-        """Raise ValueError where the policy cannot drive this task with these arms and cameras."""
+    def check(
+        self, task: str, arms: Iterable[str], cameras: Iterable[str], table: StiffnessTable | None = None
+    ) -> None:
+        """Raise ValueError where the policy cannot drive this task with these arms and cameras.
+
+        Neither can it through a controller set up for another `table` than the one it learned with.
+        """
         arms, cameras = tuple(arms), tuple(cameras)
         if task != self.task:
             raise ValueError(f"{self.run} learned {self.task!r}, not {task!r}.")
@@ -49,6 +56,11 @@ class PolicySpec:
             raise ValueError(f"{self.run} drives the arms {self.arms}, not {arms}.")
         if missing := [name for name in self.cameras if name not in cameras]:
             raise ValueError(f"{self.run} needs the cameras {missing}; there are {sorted(cameras)}.")
+        if table not in (None, self.stiffness_table):
+            raise ValueError(
+                f"{self.run} learned with --stiffness-table {self.stiffness_table}; the controller is set up "
+                f"for {table}, whose rotational gain is another."
+            )
 
 
 @dataclass(frozen=True, slots=True)

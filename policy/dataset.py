@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from controller.stiffness import StiffnessTable
 from controller.types import Array
 from policy import rotations
 from policy.config import TrainConfig
@@ -52,6 +53,7 @@ class Dataset:
         self.folder = folder
         self.task: str = index["task"]
         self.arms: tuple[str, ...] = tuple(index["arms"])
+        self.stiffness_table: StiffnessTable = index.get("stiffness_table", "tuned")  # older caches: untold
         self.cameras = {name: (height, width) for name, (height, width) in index["cameras"].items()}
         self.recorded = {name: (height, width) for name, (height, width) in index["recorded"].items()}
         self.takes = tuple(

@@ -226,6 +226,7 @@ class Learner:
             wrench_history=config.wrench_history if config.wrench else 0,
             wrench_rate=1.0 / datasets.GRID,
             step=self.step,
+            stiffness_table=self.dataset.stiffness_table,
         )
         told = Checkpoint(
             spec=spec,

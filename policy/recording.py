@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from controller.stiffness import StiffnessTable
 from controller.types import Array
 
 
@@ -33,6 +34,7 @@ class Recording(Protocol):
     arms: tuple[str, ...]
     cameras: Mapping[str, tuple[int, int]]  # (height, width) [px]
     span: tuple[float, float]  # [s] of the part to learn from
+    stiffness_table: StiffnessTable  # what the controller was set up for
 
     def track(self, arm: str) -> ArmTrack: ...
 

@@ -21,6 +21,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from controller.servo import ServoConfig
+from controller.stiffness import StiffnessTable
 from controller.types import ARM_ROW, Action, Array, CartesianTarget, Observation, Step
 from policy import checkpoint
 from policy.agent import ChunkExecutor, ExecutionMode, PolicySpec, load_policy, read_spec
@@ -60,6 +62,8 @@ class Plan:
     latency: float = 0.02  # [s] between a question and its answer, in simulated time
     device: str = "cpu"
     spread: float = 1.0
+    # What the stiffness modes mean and the controller is set up for; of a policy always as it learned.
+    stiffness_table: StiffnessTable | None = None
     cameras: bool = False  # record images although the agent needs none
 
     def __post_init__(self) -> None:
@@ -72,7 +76,8 @@ class Plan:
             if self.hide:
                 raise ValueError(f"Nothing can be hidden from {self.agent!r}: it is no policy.")
             return
-        self.spec.check(self.task, [arm.name for arm in task.arms], [view.name for view in task.cameras])
+        arms, cameras = [arm.name for arm in task.arms], [view.name for view in task.cameras]
+        self.spec.check(self.task, arms, cameras, self.stiffness_table)
         ChunkExecutor(self.execution, self.replan_every, n_arms=len(task.arms))  # refuses what it cannot do
         if self.replan_every is not None and self.replan_every > self.spec.chunk:
             raise ValueError(f"{self.run} tells {self.spec.chunk} steps; it cannot be asked less often.")
@@ -108,7 +113,7 @@ class Plan:
     def provenance(self) -> dict[str, Any]:
         """What a rollout's header tells of its agent."""
         if self.spec is None:
-            return {"run": self.run}
+            return {"run": self.run, "stiffness_table": self.table}
         executor = ChunkExecutor(self.execution, self.replan_every, n_arms=len(self.spec.arms))
         return {
             "run": self.run,
@@ -117,7 +122,13 @@ class Plan:
             "replan_every": executor.replan_every,
             "hidden": list(self.hide),
             "latency_s": self.latency,
+            "stiffness_table": self.table,
         }
+
+    @property
+    def table(self) -> StiffnessTable:
+        """What the controller is set up for: as the policy learned; for a reference as asked, or tuned."""
+        return self.spec.stiffness_table if self.spec else self.stiffness_table or "tuned"
 
     @property
     def sees(self) -> bool:
@@ -127,7 +138,11 @@ class Plan:
     def station(self, data_dir: Path) -> Station:
         """Where the agent is rolled out."""
         return Station(
-            self.task, data_dir, cameras=self.cameras or self.sees, hide_objects="objects" in self.hide
+            self.task,
+            data_dir,
+            cameras=self.cameras or self.sees,
+            hide_objects="objects" in self.hide,
+            config=ServoConfig.for_table(self.table),
         )
 
     def opened(self) -> Callable[[Twin], Agent]:
@@ -145,7 +160,9 @@ class Plan:
             )
         )
         mind = Immediate(policy, self.latency)
-        return lambda twin: PolicyAgent(mind, self.execution, self.replan_every, seed=twin.seed)
+        return lambda twin: PolicyAgent(
+            mind, self.execution, self.replan_every, seed=twin.seed, grippers=twin.grippers
+        )
 
 
 def _checkpoint_of(agent: str, data_dir: Path) -> Path:

@@ -72,6 +72,8 @@ class Evaluation:
         extra = [f"{hidden} hidden" for hidden in self.provenance.get("hidden", ())]
         if self.provenance.get("execution") == "ensemble":
             extra.append("ensemble")
+        if (table := self.provenance.get("stiffness_table", "tuned")) != "tuned":
+            extra.append(f"{table} stiffness")
         return f"{self.run} ({', '.join(extra)})" if extra else self.run
 
     @property

@@ -239,7 +239,7 @@ class LiveSession:
     def _set_driver(self, driver: m.Driver, operator: str, policy: str = "") -> None:
         agent: Agent = self._hands
         if driver == "policy":
-            agent = self._pilot.agent(policy or self._pilot.run, self._robot.task)
+            agent = self._pilot.agent(policy or self._pilot.run, self._robot)
         elif driver == "script":
             agent = ScriptedAgent(self._robot, self._robot.seed)
         self._driver, self._operator = driver, operator

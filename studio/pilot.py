@@ -13,7 +13,7 @@ from typing import Any
 from policy.agent import PolicySpec, read_spec
 from studio.inputs.policy import PolicyAgent, Thinking
 from studio.policy_link import start
-from studio.tasks import Task
+from studio.twin import Twin
 
 
 def folder_of(run: str, data_dir: Path) -> Path:
@@ -62,15 +62,16 @@ class Pilot:
         spec = self._mind.spec
         return {"run": spec.run, "step": spec.step, **self._agent.execution}
 
-    def agent(self, run: str, task: Task) -> PolicyAgent:
-        """What lets a run's newest policy drive. Raises KeyError or ValueError with why it cannot."""
-        folder = folder_of(run, self._data_dir)
+    def agent(self, run: str, twin: Twin) -> PolicyAgent:
+        """What lets a run's newest policy drive `twin`. Raises KeyError or ValueError with why it cannot."""
+        folder, task = folder_of(run, self._data_dir), twin.task
         spec = read_spec(folder)
-        spec.check(task.name, [arm.name for arm in task.arms], [view.name for view in task.cameras])
+        arms, cameras = [arm.name for arm in task.arms], [view.name for view in task.cameras]
+        spec.check(task.name, arms, cameras, twin.config.stiffness_table)
         if self._mind is None or self._mind.spec != spec or self._mind.error:
             self.close()
             self._mind = Thinking(spec, partial(start, folder))
-        self._agent = PolicyAgent(self._mind)
+        self._agent = PolicyAgent(self._mind, grippers=twin.grippers)
         return self._agent
 
     def close(self) -> None:

@@ -17,7 +17,8 @@ from functools import cache
 import numpy as np
 
 from controller.model import ArmModel, ur5e
-from controller.stiffness import stiffness_of
+from controller.servo import ServoConfig
+from controller.stiffness import StiffnessTable, stiffness_of
 from controller.types import (
     ARM_ROW,
     Action,
@@ -95,7 +96,8 @@ def nothing(twin: Twin) -> Agent:
 
 def average(twin: Twin) -> Agent:
     """One motion for every scene: the mean of the demonstrations of `AVERAGED`, which other seeds drew."""
-    return ReplayAgent([*_lead_in(twin, (motion := _average_of(twin.task.name, twin.spread))[0]), *motion])
+    motion = _average_of(twin.task.name, twin.spread, twin.config.stiffness_table)
+    return ReplayAgent([*_lead_in(twin, motion[0]), *motion])
 
 
 def replay(twin: Twin) -> Agent:
@@ -104,6 +106,11 @@ def replay(twin: Twin) -> Agent:
     motion = demonstrated(twin, seed + ANOTHER, spread).actions
     twin.reset(seed, spread)
     return ReplayAgent([*_lead_in(twin, motion[0]), *motion])
+
+
+def stiffened(twin: Twin, mode: StiffnessMode) -> Agent:
+    """The demonstrator, all of it in one mode."""
+    return Stiffened(ScriptedAgent(twin, twin.seed), stiffness_of(mode, twin.config.stiffness_table))
 
 
 def off_under_joint_control(twin: Twin) -> Agent:
@@ -145,8 +152,8 @@ REFERENCES: dict[str, Callable[[Twin], Agent]] = {
     "nothing": nothing,
     "average": average,
     "replay": replay,
-    "all-low": lambda twin: Stiffened(ScriptedAgent(twin, twin.seed), stiffness_of(StiffnessMode.LOW)),
-    "all-high": lambda twin: Stiffened(ScriptedAgent(twin, twin.seed), stiffness_of(StiffnessMode.HIGH)),
+    "all-low": lambda twin: stiffened(twin, StiffnessMode.LOW),
+    "all-high": lambda twin: stiffened(twin, StiffnessMode.HIGH),
     "off-compliant": off_under_compliance,
     "off-joint": off_under_joint_control,
 }
@@ -180,20 +187,21 @@ def _lead_in(twin: Twin, first: Action) -> list[Action]:
     hands, moves = [], []
     for arm, wanted in zip(twin.arms, first.arms, strict=True):
         assert isinstance(wanted.target, CartesianTarget)
-        hands.append(hand := Motion(arm.servo.target, StiffnessMode.MEDIUM, arm.servo.gripper))
+        table = twin.config.stiffness_table
+        hands.append(hand := Motion(arm.servo.target, StiffnessMode.MEDIUM, arm.servo.gripper, table))
         moves.append(hand.move(wanted.target.base_from_target, LEAD_IN))
     return list(together(hands, *moves))
 
 
 @cache
-def _average_of(task: str, spread: float) -> list[Action]:
+def _average_of(task: str, spread: float, table: StiffnessTable) -> list[Action]:
     """The mean motion of the demonstrations of `AVERAGED`.
 
     Averaged phase by phase, each stretched to its mean length; a phase ends where a stiffness changes, or a
     hand begins or ends to open or close. Only demonstrations with the usual phases count, and of these the
     half that is nearest to the most central one: the mean of two ways to go about it would be neither.
     """
-    twin = Twin(tasks.load(task))
+    twin = Twin(tasks.load(task), ServoConfig.for_table(table))
     homes = np.array([arm.world_from_home.wxyz for arm in twin.task.arms])
     phased = [_phases(demonstrated(twin, seed, spread).actions, homes) for seed in AVERAGED]
     usual, _ = Counter(keys for keys, _ in phased).most_common(1)[0]

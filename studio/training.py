@@ -26,6 +26,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from controller.stiffness import StiffnessTable
 from controller.types import Array
 from policy.cache import Size, build
 from policy.checkpoint import CONFIG, read_spec
@@ -277,6 +278,7 @@ class _TakeRecording:
         self.name = header.episode_id
         self.task = header.task
         self.arms = header.arms
+        self.stiffness_table: StiffnessTable = header.control.get("servo", {}).get("stiffness_table", "tuned")
         self.cameras: Mapping[str, Size] = {
             name: (height, width) for name, (width, height) in header.cameras.items()
         }

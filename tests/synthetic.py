@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from controller.stiffness import StiffnessTable
 from policy.cache import Size, build
 from policy.dataset import Dataset
 from policy.recording import ArmTrack, Recording
@@ -30,6 +31,7 @@ class Synthetic:
     image_rate: float = 20.0
     late: float = 0.0  # [s] by which the images of the second camera are late
     cut: tuple[float, float] | None = None
+    stiffness_table: StiffnessTable = "tuned"
     stiffness: Sequence[float] = (500.0, 0, 0, 500, 0, 500, 35, 0, 0, 35, 0, 35)
 
     @property

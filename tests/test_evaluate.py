@@ -105,7 +105,11 @@ def test_forces_agree_with_the_recordings(data: Path, demonstrator: Evaluation) 
             assert row.mean_force == pytest.approx(rollout.force_mean_N, rel=0.02)
             with studio.open(rollout.episode_id) as episode:
                 told = episode.header.provenance
-                assert told == {"evaluation": demonstrator.evaluation_id, "run": "demonstrator"}
+                assert told == {
+                    "evaluation": demonstrator.evaluation_id,
+                    "run": "demonstrator",
+                    "stiffness_table": "tuned",
+                }
                 assert episode.duration == pytest.approx(rollout.seconds, abs=0.01)
 
 
@@ -226,7 +230,33 @@ def test_a_policy_of_another_process_is_evaluated(tmp_path: Path, monkeypatch: p
                 "replan_every": 18,
                 "hidden": [],
                 "latency_s": 0.05,
+                "stiffness_table": "tuned",
             }
+
+
+def test_a_policy_meets_the_controller_that_it_learned_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(TOKEN, "open sesame")
+    monkeypatch.setattr(wiping.Task, "time_limit", 0.1)
+    literal = dataclasses.replace(SPEC, stiffness_table="literal")
+    with PolicyServer(Riser(literal), "open sesame") as server, Studio(tmp_path) as studio:
+        plans = [
+            Plan.of(server.address, None, (4,), tmp_path),
+            Plan.of("all-low", "wiping", (4,), tmp_path, stiffness_table="literal"),
+            Plan.of("all-low", "wiping", (4,), tmp_path),
+        ]
+        for plan, gain, low in zip(plans, (0.035, 0.035, 0.5), (20.0, 250.0, 20.0), strict=True):
+            found = studio.evaluate(plan)
+            assert found.summary()["stiffness_table"] == plan.table
+            assert ("literal stiffness" in found.label) == (plan.table == "literal")
+            with studio.open(found.rollouts[0].episode_id) as episode:
+                servo = episode.header.control["servo"]
+                assert (servo["stiffness_table"], servo["fdcc"]["p_gains"][-1]) == (plan.table, gain)
+                stiffness = episode.columns("right/requested")["right/requested/stiffness"]
+                assert stiffness[-1, -1] == low  # what the policy says itself is its own affair
+        with pytest.raises(ValueError, match="learned with --stiffness-table literal"):
+            Plan.of(server.address, None, (4,), tmp_path, stiffness_table="tuned")
 
 
 def test_a_run_is_evaluated_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

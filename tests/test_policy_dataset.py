@@ -123,6 +123,7 @@ def test_without_cameras_moments_are_sampled_at_20_hz(tmp_path: Path) -> None:
         ({"arms": ("left", "right")}, r"b has arms \['left', 'right'\], but a \['right'\]"),
         ({"cameras": {"front": (48, 64)}}, "b has cameras"),
         ({"cameras": {}}, "b has no images; --no-images"),
+        ({"stiffness_table": "literal"}, "b has stiffness table literal, but a tuned"),
         ({"image_rate": 10.0}, "b has front at 10.0 Hz, but a at 20.0"),
         ({"cameras": {"front": (48, 64), "wrist": (24, 64)}}, "differ in size"),
     ],

@@ -43,6 +43,7 @@ TINY = TrainConfig(
     save_every=4,
     validation=0.3,
     device="cpu",
+    threads=1,  # two that wait for each other take minutes on a busy machine
 )
 
 
@@ -255,8 +256,13 @@ def test_a_checkpoint_of_another_task_or_version_is_refused(tmp_path: Path, data
         spec.check("drawing", ["right"], ["front", "wrist"])
     with pytest.raises(ValueError, match=r"needs the cameras \['wrist'\]"):
         spec.check("wiping", ["right"], ["front"])
+    with pytest.raises(ValueError, match=r"learned with --stiffness-table tuned; .* set up for literal"):
+        spec.check("wiping", ["right"], ["front", "wrist"], "literal")
     description = checkpoint.find(tmp_path / "run") / checkpoint.DESCRIPTION
     told = json.loads(description.read_text())
+    older = {name: value for name, value in told["spec"].items() if name != "stiffness_table"}
+    description.write_text(json.dumps({**told, "spec": older}))
+    assert read_spec(tmp_path / "run") == spec  # checkpoints of before there was a choice
     description.write_text(json.dumps({**told, "format": 99}))
     with pytest.raises(ValueError, match="has format 99; this version reads 1"):
         load_policy(tmp_path / "run")

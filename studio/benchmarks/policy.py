@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from controller.stiffness import StiffnessTable
 from controller.types import Array
 from policy.agent import Inputs, load_policy
 from policy.cache import Size, build
@@ -165,6 +166,7 @@ class _MadeUp:
     """A take of arms that wander, seen by cameras that show noise; implements `Recording`."""
 
     task = "made-up"
+    stiffness_table: StiffnessTable = "tuned"
 
     def __init__(self, seed: int, arms: tuple[str, ...], cameras: tuple[str, ...]) -> None:
         self.name, self.arms = f"take {seed}", arms

@@ -195,7 +195,7 @@ def _evaluate(studio: Any, where: Where, arguments: Sequence[str]) -> Request:
     given = _parsed("evaluate", policies.evaluate, arguments)
     _refuse(given, seeds=None, compare=None)
     names = ("task", "seed", "episodes", "workers", "hide", "execution", "replan_every", "latency", "device")
-    asked = {name: given[name] for name in (*names, "spread", "cameras")}
+    asked = {name: given[name] for name in (*names, "spread", "stiffness_table", "cameras")}
     return plans.evaluate(studio.catalog, where, given["agent"], **asked)
 
 

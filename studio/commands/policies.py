@@ -7,10 +7,11 @@ import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from controller.stiffness import StiffnessTable
 from policy.config import PRESETS, TrainConfig
 from studio.commands.terminal import (
     DATA,
@@ -29,6 +30,9 @@ from studio.commands.terminal import (
 )
 from studio.index import Filters
 from studio.jobs.progress import ProgressFile
+
+if TYPE_CHECKING:
+    from studio.evaluate import Plan
 
 
 def train(
@@ -134,6 +138,7 @@ def evaluate(
     workers: int = 1,
     cameras: bool = False,
     spread: float = 1.0,
+    stiffness_table: StiffnessTable | None = None,
     progress_file: ProgressPath = None,
     json: Json = False,
 ) -> int:
@@ -156,11 +161,9 @@ def evaluate(
         workers: Processes that roll out side by side.
         cameras: Record images although the agent needs none.
         spread: Above 1 widens the task's randomisation.
+        stiffness_table: What low, medium and high mean to a reference; a policy has what it learned with.
     """
-    from studio.api import Studio
     from studio.evaluate import Plan
-    from studio.evaluation import Rollout
-    from studio.evaluation import compare as compared
 
     plan = Plan.of(
         agent,
@@ -173,10 +176,21 @@ def evaluate(
         latency=latency,
         device=device,
         spread=spread,
+        stiffness_table=stiffness_table,
         cameras=cameras,
     )
+    return _roll_out(plan, compare, data, workers, progress_file, json)
+
+
+def _roll_out(
+    plan: Plan, other: str | None, data: Path, workers: int, progress_file: Path | None, json: bool
+) -> int:
+    """Evaluate a plan, compare it with the evaluation named `other`, and print both."""
+    from studio.api import Studio
+    from studio.evaluation import Rollout, compare
+
     with Studio(data) as studio:
-        other = studio.evaluation(compare, plan.task) if compare else None
+        found_before = studio.evaluation(other, plan.task) if other else None
         file = ProgressFile(progress_file, len(plan.seeds))
         with progress(f"{plan.run} on {plan.task}", len(plan.seeds), quiet=json) as advance, ends_orderly():
 
@@ -186,7 +200,7 @@ def evaluate(
 
             found = studio.evaluate(plan, workers=workers, on_rollout=tell)
         file.end(found.summary())
-    comparison = compared(found, other) if other else None
+    comparison = compare(found, found_before) if found_before else None
     if json:
         paired = {"comparison": dataclasses.asdict(comparison)} if comparison else {}
         print_json(found.summary() | paired)
