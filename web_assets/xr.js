@@ -1,6 +1,7 @@
 // The headset's page: tests what a session needs, keeps the operator's settings, shows what the robot does.
 
 import { Channel } from "/assets/xr_channel.js";
+import { FOLLOWS, LOST, MOST_FORCE, driver } from "/assets/xr_words.js";
 
 const FUNCTIONS = {
   clutch: "Clutch",
@@ -34,12 +35,20 @@ function build() {
     for (const [button, text] of Object.entries(BUTTONS)) choice.append(new Option(text, button));
     find("mapping").append(label, choice);
   }
-  fill({ ...PRESETS.paper, ...JSON.parse(localStorage.getItem(STORED) ?? "{}") });
+  fill({ ...PRESETS.paper, ...stored() });
   for (const button of form.querySelectorAll("[data-preset]")) {
     button.onclick = () => { fill(PRESETS[button.dataset.preset]); changed(); };
   }
   form.oninput = changed;
   form.onsubmit = (event) => event.preventDefault();
+}
+
+function stored() {
+  try {
+    return JSON.parse(localStorage.getItem(STORED) ?? "{}");
+  } catch {
+    return {}; // what is no JSON was not written by us
+  }
 }
 
 function fill(values) {
@@ -109,12 +118,12 @@ function buildChecks() {
 async function test() {
   const secure = window.isSecureContext;
   verdict("context", secure ? "yes" : "no", secure ? "HTTPS or this machine"
-    : "Browsers offer WebXR over HTTPS only: run `studio cert`, then open the https:// address.");
+    : "Browsers offer WebXR over HTTPS only: open the https:// link that `studio serve --host 0.0.0.0` prints.");
   verdict("webxr", navigator.xr ? "yes" : "no", navigator.xr ? "offered by this browser"
     : secure ? "This browser has none. Use the headset's own browser, or Chrome with SteamVR." : "not offered on an insecure page");
   for (const [name, mode] of [["vr", "immersive-vr"], ["ar", "immersive-ar"]]) {
     const offered = Boolean(await navigator.xr?.isSessionSupported(mode).catch(() => false));
-    verdict(name, offered ? "yes" : "maybe", offered ? "ready" : "no headset offers it here");
+    verdict(name, offered ? "yes" : "maybe", offered ? "ready" : "not here: open this page in the headset's own browser");
     find(name).disabled = !(offered && headset);
   }
   if (!seen.size) verdict("controllers", "maybe", "seen as soon as you enter");
@@ -124,9 +133,10 @@ async function test() {
 async function measure() {
   verdict("trip", "", "measuring…");
   verdict("jitter", "", "");
-  const trips = await channel.measure(PINGS);
+  const trips = (await channel.opens()) ? await channel.measure(PINGS) : [];
   if (trips.length < PINGS / 2) {
     verdict("trip", "no", "The studio does not answer.");
+    verdict("jitter", "", "unknown");
     return;
   }
   const sorted = [...trips].sort((a, b) => a - b);
@@ -141,8 +151,7 @@ async function measure() {
 // What the robot does now
 
 function show(state) {
-  const holder = state.is_mine ? "you drive" : state.holder ? `${state.holder} drives` : "nobody drives";
-  find("session").textContent = state.session === "open" ? `${state.task} · ${holder}` : `session ${state.session}`;
+  find("session").textContent = `${state.task} · ${LOST[state.session] ?? driver(state)}`;
   find("said").textContent = state.said || why;
   find("take").textContent = { idle: state.kept && `Last take: ${state.kept}`, countdown: `Recording in ${Math.ceil(state.countdown)} s`,
     recording: `Recording, ${state.seconds.toFixed(0)} s` }[state.phase];
@@ -155,22 +164,30 @@ function show(state) {
 
 function card() {
   const element = Object.assign(document.createElement("div"), { className: "arm" });
-  element.innerHTML = '<div class="row"><b></b><span></span></div><div class="row"><span></span><span></span></div>' +
-    '<div class="bar"><i></i></div><div class="bar"><i class="felt"></i></div><p class="why"></p>';
+  const row = (words) => `<div class="row"><span>${words}</span><span></span></div>`;
+  element.innerHTML = `${row("<b></b>")}${row("Stiffness")}${row("Contact force")}<div class="bar"><i></i></div>` +
+    `${row("Vibration")}<div class="bar"><i class="felt"></i></div><p class="why"></p>`;
   return element;
 }
 
 function fillCard(element, arm) {
-  const [name, led, mode, force] = element.querySelectorAll("b, span");
+  const [led, mode, force, vibration] = element.querySelectorAll(".row > :last-child");
   const [pressed, felt] = element.querySelectorAll("i");
-  name.textContent = `${arm.name} arm`;
-  led.textContent = arm.engaged ? "follows your hand" : "waits for the clutch";
+  element.querySelector("b").textContent = `${arm.name[0].toUpperCase()}${arm.name.slice(1)} arm`;
+  led.textContent = arm.engaged ? FOLLOWS : waiting();
   led.className = arm.engaged ? "led" : "dim";
   mode.textContent = arm.mode;
-  force.textContent = `${arm.newtons.toFixed(1)} N · vibration ${(100 * arm.amplitude).toFixed(0)} %`;
-  pressed.style.width = `${Math.min(100, arm.newtons)}%`;
+  force.textContent = `${arm.newtons.toFixed(1)} N`;
+  vibration.textContent = `${(100 * arm.amplitude).toFixed(0)} %`;
+  pressed.style.width = `${Math.min(100, (100 * arm.newtons) / MOST_FORCE)}%`;
   felt.style.width = `${100 * arm.amplitude}%`;
   element.querySelector("p").textContent = arm.why;
+}
+
+// What takes hold of an arm that does not follow.
+function waiting() {
+  const { clutch, hold_to_clutch } = settings();
+  return `${hold_to_clutch ? "hold " : ""}${BUTTONS[clutch] ?? "the clutch"} ${hold_to_clutch ? "to take" : "takes"} hold`;
 }
 
 // Entering
@@ -183,7 +200,11 @@ const channel = new Channel();
 channel.onOpen = tell;
 channel.onState = (state) => { show(state); headset?.show(state); };
 channel.onBinary = (kind, data) => headset?.showBinary(kind, data);
-channel.onLost = () => { find("session").textContent = "no connection to the studio"; headset?.disconnect(); };
+channel.onLost = () => {
+  find("session").textContent = "";
+  find("said").textContent = "No connection to the studio; it is tried again every second.";
+  headset?.disconnect();
+};
 
 async function enter(mode) {
   why = "";
@@ -211,6 +232,7 @@ try {
     },
     onEnd: (words) => { why = words; find("said").textContent = words; },
     oneArm: () => settings().one_arm,
+    waiting,
   });
   verdict("drawing", "yes", "three.js");
 } catch (error) {

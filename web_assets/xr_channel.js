@@ -4,6 +4,7 @@ const WAITING = 4096; // [bytes] unsent beyond which a frame is dropped: the nex
 const RETRY = 1000; // [ms]
 const PING_GAP = 20; // [ms]
 const KEPT_TRIPS = 50;
+const PATIENCE = 5000; // [ms] for a first connection
 
 export class Channel {
   onOpen = () => {};
@@ -20,6 +21,12 @@ export class Channel {
     socket.onopen = () => { this.#socket = socket; this.onOpen(); };
     socket.onclose = () => { this.#socket = null; this.onLost(); setTimeout(() => this.open(), RETRY); };
     socket.onmessage = ({ data }) => this.#hear(data);
+  }
+
+  // Whether it is open, or soon is.
+  async opens() {
+    for (let waited = 0; !this.#socket && waited < PATIENCE; waited += PING_GAP) await sleep(PING_GAP);
+    return this.#socket !== null;
   }
 
   // The shortest round trip of late [ms]; null before the first.
@@ -45,9 +52,9 @@ export class Channel {
     const trips = this.#measured = [];
     for (let n = 0; n < count; n++) {
       this.ping();
-      await new Promise((resolve) => setTimeout(resolve, PING_GAP));
+      await sleep(PING_GAP);
     }
-    await new Promise((resolve) => setTimeout(resolve, 10 * PING_GAP));
+    await sleep(10 * PING_GAP);
     this.#measured = null;
     return this.#heardTrips > before ? trips : [];
   }
@@ -72,3 +79,5 @@ export class Channel {
     if (this.#trips.length > KEPT_TRIPS) this.#trips.shift();
   }
 }
+
+function sleep(duration) { return new Promise((resolve) => setTimeout(resolve, duration)); }

@@ -27,7 +27,7 @@ export class Headset {
     this.#on = on;
     this.#renderer.xr.enabled = true;
     this.#renderer.xr.setReferenceSpaceType("local-floor");
-    this.#stage = new Stage(this.#renderer);
+    this.#stage = new Stage(this.#renderer, on.waiting);
   }
 
   async enter(mode) {

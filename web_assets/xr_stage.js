@@ -3,6 +3,7 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { FOLLOWS, LOST, MOST_FORCE, driver } from "/assets/xr_words.js";
 
 const POSES = 1, IMAGE = 2, INK = 3; // kinds of binary messages
 const METRES_PER_NEWTON = 0.006; // of a force arrow
@@ -30,8 +31,12 @@ export class Stage {
   #state = null;
   #floor;
 
-  constructor(renderer) {
+  #waiting;
+
+  // `waiting` tells what takes hold of an arm.
+  constructor(renderer, waiting) {
     this.#renderer = renderer;
+    this.#waiting = waiting;
     this.#world.visible = false;
     this.#world.add(this.#twin);
     this.#scene.add(this.#world, this.#board.mesh, this.#screens, this.#hands.left, this.#hands.right);
@@ -42,7 +47,6 @@ export class Stage {
     this.#floor = new THREE.GridHelper(8, 16, 0x38414e, 0x262c34);
     this.#scene.add(this.#floor);
   }
-
 
   begin(isPassthrough) {
     this.#scene.background = isPassthrough ? null : new THREE.Color(0x14171c);
@@ -55,7 +59,7 @@ export class Stage {
     this.#screens.visible = images;
   }
 
-  say(words) { this.#board.write({ ...this.#state, said: words }); }
+  say(words) { this.#board.write({ ...this.#state, said: words }, this.#waiting()); }
 
   show(state) {
     this.#state = state;
@@ -67,7 +71,7 @@ export class Stage {
       this.#world.visible = true;
     }
     state.arms.forEach((arm, n) => this.#showArm(n, arm));
-    this.#board.write(state);
+    this.#board.write(state, this.#waiting());
   }
 
   showBinary(kind, data) {
@@ -179,8 +183,8 @@ class Board {
     new THREE.MeshBasicMaterial({ map: this.#texture, transparent: true }),
   );
 
-  write(state) {
-    const words = content(state);
+  write(state, waiting) {
+    const words = content(state, waiting);
     const key = JSON.stringify(words);
     if (key === this.#shown) return;
     this.#shown = key;
@@ -203,7 +207,7 @@ class Board {
       pen.fillStyle = "#2a2f37";
       pen.fillRect(left, 258, wide, 22);
       pen.fillStyle = arm.newtons > 30 ? BAD : WARN;
-      pen.fillRect(left, 258, (wide * Math.min(arm.newtons, 50)) / 50, 22);
+      pen.fillRect(left, 258, (wide * Math.min(arm.newtons, MOST_FORCE)) / MOST_FORCE, 22);
       text(pen, `${arm.newtons} N`, left, 322, 34, CALM);
       lines(pen, arm.why, left, 368, 28, WARN, wide);
     });
@@ -212,16 +216,16 @@ class Board {
   }
 }
 
-function content(state) {
-  const { phase, countdown = 0, seconds = 0, is_mine, holder, session, kept } = state;
-  const who = is_mine ? "you drive" : holder ? `${holder} drives` : "nobody drives";
+function content(state, waiting) {
+  const { phase, countdown = 0, seconds = 0, session, kept } = state;
+  const who = driver(state);
   const time = `${String(Math.floor(seconds / 60)).padStart(2, "0")}:${String(Math.floor(seconds) % 60).padStart(2, "0")}`;
-  const [head, color] = session !== "open" ? [`Session ${session ?? "unknown"}`, BAD]
+  const [head, color] = session in LOST ? [LOST[session], BAD]
     : phase === "recording" ? [`● REC ${time}`, BAD]
     : phase === "countdown" ? [`Recording in ${Math.ceil(countdown)}`, WARN]
     : [kept ? `${who} · last take: ${kept}` : who, CALM];
   const arms = (state.arms ?? []).map(({ name, mode, engaged, newtons, why }) => ({
-    name, mode, engaged, newtons: Math.round(newtons), why: why.slice(0, 120), led: engaged ? "follows your hand" : "waits for the clutch",
+    name, mode, engaged, newtons: Math.round(newtons), why: why.slice(0, 120), led: engaged ? FOLLOWS : waiting,
   }));
   return { head, color, arms, said: (state.said ?? "").slice(0, 90) };
 }
