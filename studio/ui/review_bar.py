@@ -22,6 +22,7 @@ GUTTER, MARGIN = 90, 62  # [px] left and right of every row of the bar; `web_ass
 POINTS = 400  # of a plot
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 STIFF = 800.0  # [N/m] up to here the stiffness plot goes at least
+LEAST = {"Force": 2.0, "Torque": 0.2}  # [N], [N·m] the other never shows less than this both ways
 WHITE = "#e6e9ee"
 STIFFNESS_COLORS = (WHITE, "#ffb84d")  # of the arms
 
@@ -123,7 +124,7 @@ class ReviewBar:
                 ),
             ),
             scales={
-                "x": uplot.Scale(time=False, range=(0.0, max(self._cursor.duration, 0.01))),
+                "x": self._times(),
                 "y": scale or uplot.Scale(),
             },
             axes=(
@@ -135,6 +136,9 @@ class ReviewBar:
             height=height,
             padding=(8, MARGIN, 0 if is_lowest else 4, 0),
         )
+
+    def _times(self) -> uplot.Scale:
+        return uplot.Scale(time=False, range=(0.0, max(self._cursor.duration, 0.01)))
 
     def _plottable(self) -> dict[str, tuple[int, slice]]:
         """What the upper plot can show: the arm and its part of the wrench."""
@@ -155,9 +159,13 @@ class ReviewBar:
         return (arm.time[kept], *values[kept].T.copy(), norm[kept])
 
     def _plot(self) -> None:
+        what = self._choice.value
+        least = LEAST[what.split()[0]]
+        soft = {"mode": 1, "pad": 0.1}
+        y = uplot.Scale(range={"min": {"soft": -least, **soft}, "max": {"soft": least, **soft}})
+        self._chosen.scales = {"x": self._times(), "y": y}
         self._chosen.data = self._curves()
         colors = dict(zip(("x", "y", "z", "norm"), (*AXIS_COLORS, WHITE), strict=True))
-        what = self._choice.value
         self._key.content = timeline.key(what, "N" if what.startswith("Force") else "N·m", colors)
 
     def _step(self, steps: int) -> None:

@@ -80,7 +80,8 @@ class TakeList:
     def offer_undo(self, deleted: str | None) -> None:
         """Offer to bring back the take of this id, or nothing."""
         self._undo.visible = deleted is not None
-        self._undo.label = f"Undo: bring back {deleted}"
+        # Of the id the part that tells it from others fits.
+        self._undo.label = f"Undo: bring back {(deleted or '').split('-', 1)[-1]}"
 
     def neighbour(self, episode_id: str, steps: int) -> str | None:
         """Id of the take so many further down the filtered list."""
