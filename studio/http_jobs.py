@@ -93,6 +93,8 @@ class EvaluateIn(Asked):
     hide: list[Literal["images", "objects", "wrench"]] = Field(default_factory=list)
     execution: Literal["replan", "ensemble"] = "replan"
     replan_every: Annotated[int, Field(ge=1, le=1000)] | None = None
+    latency: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.02
+    device: Literal["cpu", "cuda"] = "cpu"
     spread: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 1.0
     cameras: bool = False
 
@@ -109,6 +111,8 @@ class EvaluateIn(Asked):
             hide=tuple(self.hide),
             execution=self.execution,
             replan_every=self.replan_every,
+            latency=self.latency,
+            device=self.device,
             spread=self.spread,
             cameras=self.cameras,
         )

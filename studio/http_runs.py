@@ -22,6 +22,7 @@ from studio.index import EpisodeRow
 from studio.jobs.form import train_form
 from studio.jobs.plans import default_threads
 from studio.reading import Reader
+from studio.references import REFERENCES
 from studio.runs import MOST_POINTS, POINTS, Metrics, MetricsReader, RunInfo
 
 REFUSED: dict[int | str, dict[str, Any]] = {
@@ -169,6 +170,11 @@ def _evaluations_router(studio: Studio, reader: Reader) -> APIRouter:
         """What came of each, the newest first."""
         found = studio.evaluations()
         return as_json([{**one.summary(), "label": one.label, "started": one.started} for one in found])
+
+    @router.get("/references", response_model=list[str])
+    def list_references() -> Response:
+        """Agents that can be evaluated besides runs: what a policy has to be measured against."""
+        return as_json(list(REFERENCES))
 
     @router.get("/evaluations/{evaluation_id}", response_model=EvaluationDetails)
     def read_evaluation(evaluation_id: EvaluationId) -> Response:

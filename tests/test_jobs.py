@@ -211,6 +211,14 @@ def test_deleting_a_job_and_its_run_can_be_undone(studio: Studio) -> None:
     assert sorted(path.name for path in run.iterdir()) == kept
     with pytest.raises(KeyError, match="in the trash"):
         studio.jobs.restore(now.job.job_id)
+    # Another may have that name meanwhile, and be deleted, too.
+    studio.jobs.delete(now.job.job_id)
+    other = studio.submit(training(studio))
+    with pytest.raises(ValueError, match="There is a learner by now"):
+        studio.jobs.restore(now.job.job_id)
+    studio.jobs.delete(other.job.job_id)
+    studio.jobs.restore(now.job.job_id)
+    assert json.loads((run / "origin.json").read_text())["created"] < other.job.created
 
 
 def test_folders_that_somebody_edited_are_told_apart(studio: Studio) -> None:

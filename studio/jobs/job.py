@@ -8,6 +8,7 @@ DATA/jobs/<id>/job.json        what was asked; written once
                cancel          somebody asked to stop it
                lock            held as long as its keeper or its command lives
 DATA/trash/jobs/<id>/          deleted; `restore` brings it back
+               run/            that it learned
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 # interrupted: its processes are gone without having said how it ended. lost: its cluster does not answer.
 ENDED: tuple[State, ...] = ("done", "failed", "cancelled", "interrupted")
 
-JOB, STATE, PROGRESS, LOG, CANCEL, LOCK = (
-    *("job.json", "state.json", "progress.json", "log.txt", "cancel", "lock"),
+JOB, STATE, PROGRESS, LOG, CANCEL, LOCK, RUN = (
+    *("job.json", "state.json", "progress.json", "log.txt", "cancel", "lock", "run"),
 )
 LOCAL = "local"  # the runner on this machine
 GRACE = 20.0  # [s] that a command has to end by itself, e.g. to save a checkpoint

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from controller.stiffness import StiffnessTable
 from policy import checkpoint
 from policy.config import TrainConfig
 from studio import collections, tasks, training
@@ -238,6 +239,7 @@ def demo(
     workers: int = 1,
     cameras: bool = True,
     spread: float = 1.0,
+    stiffness_table: StiffnessTable = "tuned",
 ) -> Request:
     """Record scripted demonstrations."""
     tasks.load(task)
@@ -245,7 +247,10 @@ def demo(
         raise ValueError(
             f"Episodes and workers must be at least 1, seeds 0: not {episodes}, {workers}, {seed}."
         )
-    asked = {"episodes": episodes, "seed": seed, "workers": workers, "cameras": cameras, "spread": spread}
+    asked = {
+        **{"episodes": episodes, "seed": seed, "workers": workers, "cameras": cameras, "spread": spread},
+        "stiffness_table": stiffness_table,
+    }
     return Request(
         _job(
             "demo",

@@ -31,6 +31,7 @@ from studio.jobs.job import (
     JOB,
     LOCAL,
     LOG,
+    RUN,
     STATE,
     TAIL,
     Job,
@@ -110,7 +111,7 @@ class Jobs:
 
     def trash(self) -> list[Job]:
         """The deleted ones, the newest first."""
-        found = [read_job(path.parent) for path in self._trash("jobs").glob(f"*/{JOB}")]
+        found = [read_job(path.parent) for path in self._trash.glob(f"*/{JOB}")]
         return sorted(filter(None, found), key=lambda job: job.created, reverse=True)
 
     @property
@@ -152,7 +153,7 @@ class Jobs:
             except OSError:
                 shutil.rmtree(part, ignore_errors=True)
                 raise
-        self.advance()
+        self._go_on()
         return self.get(job.job_id)
 
     def cancel(self, job_id: str) -> JobNow:
@@ -181,21 +182,20 @@ class Jobs:
                 raise JobBusyError(f"{other.job.title} is {other.standing.state} already.")
             (folder / CANCEL).unlink(missing_ok=True)
             write_json(folder / STATE, Standing("queued", queued=time.time()))
-        self.advance()
+        self._go_on()
         return self.get(job_id)
 
     def delete(self, job_id: str) -> Job:
         """Move a job to the trash, with its run; what it exported or evaluated stays."""
         with self._locked():
             now = self.get(job_id)
-            if now.standing.state in ("running", "lost"):
+            if not now.standing.is_over and (now.standing.state != "queued" or now.standing.handle):
                 raise JobBusyError(f"{now.job.title} is {now.standing.state}; cancel it first.")
             if now.job.kind == "train" and (users := self._who_evaluate(now.job.subject)):
                 raise JobBusyError(f"{users[0].job.title} is {users[0].standing.state}; cancel that first.")
             for source, target in self._places(now.job):
                 if source.exists():
                     target.parent.mkdir(parents=True, exist_ok=True)
-                    shutil.rmtree(target, ignore_errors=True)  # of an earlier one of that name
                     source.rename(target)
         return now.job
 
@@ -208,10 +208,11 @@ class Jobs:
             places = self._places(job)
             if taken := [source.name for source, target in places if target.exists() and source.exists()]:
                 raise ValueError(f"There is a {taken[0]} by now; delete that first.")
-            for source, target in places:
+            for source, target in reversed(places):
                 if target.exists():
+                    source.parent.mkdir(parents=True, exist_ok=True)
                     target.rename(source)
-        self.advance()
+        self._go_on()
         return self.get(job_id)
 
     def advance(self) -> None:
@@ -235,14 +236,11 @@ class Jobs:
         """In it the queue goes on also where a keeper was killed, or a cluster takes its time."""
         ended = threading.Event()
 
-        def go_on() -> None:
+        def look() -> None:
             while not ended.wait(PERIOD):
-                try:
-                    self.advance()
-                except OSError as error:  # e.g. a full disk: the next time, perhaps
-                    log.warning("The queue of jobs waits: %s", error)
+                self._go_on()
 
-        thread = threading.Thread(target=go_on, name="jobs", daemon=True)
+        thread = threading.Thread(target=look, name="jobs", daemon=True)
         thread.start()
         try:
             yield
@@ -250,8 +248,15 @@ class Jobs:
             ended.set()
             thread.join()
 
+    def _go_on(self) -> None:
+        """Advance, unless e.g. the disk is full: the next time, perhaps."""
+        try:
+            self.advance()
+        except OSError as error:
+            log.warning("The queue of jobs waits: %s", error)
+
     def _start(self, now: JobNow) -> None:
-        job, standing, folder = now.job, now.standing, self.folder(now.job.job_id)
+        job, standing, folder = now.job, now.standing, self._folder / now.job.job_id
         if job.runner != LOCAL:  # noted first, so that it can be found whatever happens next
             standing = dataclasses.replace(standing, handle=f"{job.job_id}-{secrets.token_hex(2)}")
             self._write(folder, standing)
@@ -278,7 +283,7 @@ class Jobs:
 
     def _settle(self, now: JobNow, told: Mapping[str, Found]) -> None:
         """Write down what became of one whose processes are gone; of a cluster, whether it answers."""
-        job, folder = now.job, self.folder(now.job.job_id)
+        job, folder = now.job, self._folder / now.job.job_id
         found: Found | None = told.get(now.standing.handle)
         if job.runner == LOCAL:
             found = LocalRunner().status(job, folder, now.standing)
@@ -343,14 +348,16 @@ class Jobs:
         return sum(now.job.runner == LOCAL and now.standing.state == "running" for now in self.all())
 
     def _places(self, job: Job) -> list[tuple[Path, Path]]:
-        """Where it lies, and where in the trash."""
-        places = [(self._folder / job.job_id, self._trash("jobs") / job.job_id)]
+        """Where it lies, and where in the trash: its run in its folder, as another may get its name."""
+        deleted = self._trash / job.job_id
+        places = [(self._folder / job.job_id, deleted)]
         if job.kind == "train":
-            places.append((self.data_dir / "runs" / job.subject, self._trash("runs") / job.subject))
+            places.append((self.data_dir / "runs" / job.subject, deleted / RUN))
         return places
 
-    def _trash(self, kind: str) -> Path:
-        return self.data_dir / "trash" / kind
+    @property
+    def _trash(self) -> Path:
+        return self.data_dir / "trash" / "jobs"
 
     def _write(self, folder: Path, standing: Standing, **changes: Any) -> None:
         with suppress(FileNotFoundError):  # somebody removed the folder meanwhile

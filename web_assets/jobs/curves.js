@@ -13,7 +13,7 @@ export class Chart {
     this.isLog = isLog;
     this.unit = unit;
     this.box = h("div", { class: "plot" });
-    this.element = h("figure", { class: "chart" }, h("figcaption", {}, title, unit && h("small", { class: "dim" }, ` ${unit}`)), this.box);
+    this.element = h("figure", { class: "chart", hidden: true }, h("figcaption", {}, title, unit && h("small", { class: "dim" }, ` ${unit}`)), this.box);
     this.watch = new ResizeObserver(() => this.plot?.setSize(this.size()));
     this.watch.observe(this.box);
   }

@@ -1,14 +1,14 @@
 // An evaluation: rollouts as they end, what they come to, figures, and another one on the same scenes.
 
 import { api } from "../dataset/api.js";
-import { attempt, h } from "../dataset/dom.js";
+import { h } from "../dataset/dom.js";
 import { date } from "../dataset/format.js";
 import { link, select } from "./fields.js";
 import { interval, progressOf } from "./job_list.js";
 
 export class EvaluationView {
   constructor(section, act) {
-    Object.assign(this, { section, act, key: null, known: new Map() });
+    Object.assign(this, { section, act, key: null, known: new Map(), progress: h("div", { class: "how-far" }) });
   }
 
   close() {
@@ -18,23 +18,26 @@ export class EvaluationView {
   }
 
   show({ id, against, job, evaluations }) {
-    const live = !id && job ? [job.standing.state, job.progress?.done, job.seconds_left && Math.round(job.seconds_left)] : null;
+    this.progress.replaceChildren(...[job && progressOf(job)].filter(Boolean));
+    const live = !id && job ? [job.standing.state, job.progress?.done] : null;
     const key = JSON.stringify([id, against, job?.job.job_id, live, evaluations.length]);
     if (key === this.key) return;
     this.key = key;
-    attempt(async () => {
-      const shown = id ? await this.whole(id, against, evaluations) : this.running(job);
-      if (key === this.key) this.section.replaceChildren(...shown.filter(Boolean));
-    });
+    this.fill(key, async () => (id ? await this.whole(id, against, evaluations) : this.running(job)));
+  }
+
+  async fill(key, make) {
+    const shown = await make().catch((error) => [h("p", { class: "empty" }, error.message)]); // e.g. somebody removed it
+    if (key === this.key) this.section.replaceChildren(...shown.filter(Boolean));
   }
 
   // While it runs, what the job tells.
-  running({ job, standing, progress, ...rest }) {
+  running({ job, standing, progress }) {
     const rollouts = progress?.rollouts ?? [];
     const judged = rollouts.filter(({ error }) => error === null);
     return [
       h("div", { class: "title" }, h("h2", {}, job.title)),
-      h("p", { class: "line" }, h("span", { class: `badge ${standing.state}` }, standing.state), progressOf({ job, standing, progress, ...rest })),
+      h("div", { class: "line" }, h("span", { class: `badge ${standing.state}` }, standing.state), this.progress),
       standing.why ? h("p", { class: "why" }, standing.why) : null,
       judged.length ? cards({
         Success: [`${judged.filter(({ success }) => success).length} / ${judged.length}`, interval(wilson(judged.filter(({ success }) => success).length, judged.length))],

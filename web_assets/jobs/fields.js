@@ -33,6 +33,8 @@ const titles = new Map(); // of the settings of training, by their names
 
 export const titleOf = (name) => titles.get(name) ?? name.replaceAll("_", " ");
 
+export const valueOf = (value) => ({ true: "yes", false: "no", null: "–" })[value] ?? String(value);
+
 // Of one property of a JSON schema: {element, read(): value, write(value)}.
 export function fieldOf(name, property) {
   const types = property.anyOf?.map((part) => part.type) ?? [property.type];
@@ -64,8 +66,14 @@ export function numberOf(label, text) {
   return value;
 }
 
-// The name under which a person asks, as on the dataset page.
-export const author = () => localStorage.getItem("studio.author") || "page";
+// Put these in, where they are not there already: what is pressed or has the focus stays.
+export function keep(parent, children) {
+  const found = children.filter(Boolean);
+  if (found.length !== parent.childNodes.length || found.some((child, n) => child !== parent.childNodes[n])) parent.replaceChildren(...found);
+}
+
+// The name under which a person asks, as on the dataset page; `known` is the one that the studio gave.
+export const author = () => localStorage.getItem("studio.author") || author.known || "guest";
 
 // The address of another page of ours; beside the 3-D view it stays beside it.
 export function link(path, query = {}) {

@@ -3,7 +3,7 @@
 import { api } from "../dataset/api.js";
 import { attempt, h, toast } from "../dataset/dom.js";
 import { date, exactDate } from "../dataset/format.js";
-import { duration, titleOf } from "./fields.js";
+import { duration, keep, titleOf, valueOf } from "./fields.js";
 import { placeOf } from "./place.js";
 
 const ACTIVE = ["queued", "running", "lost"];
@@ -13,6 +13,7 @@ const SIGNS = { queued: "◷", running: "▶", done: "✓", failed: "✗", cance
 export class JobList {
   constructor(section, act) {
     this.act = act;
+    this.rows = new Map(); // of each job: {told, element, progress}
     this.jobs = h("div", { class: "list" });
     this.results = h("div", { class: "list" });
     this.trash = h("button", { class: "link", onclick: () => attempt(() => this.showTrash()) }, "Trash");
@@ -20,27 +21,41 @@ export class JobList {
   }
 
   show({ view, jobs, runs, evaluations, chosen }) {
-    const told = JSON.stringify([view, jobs, runs.map((run) => [run.name, run.step, run.best]), evaluations.length, chosen]);
-    if (told === this.told) return;
-    this.told = told;
     const isOf = ({ job, standing }) => ACTIVE.includes(standing.state) || job.job_id === chosen.job || KINDS[view].includes(job.kind);
     jobs = jobs.filter(isOf);
+    this.nothing ??= h("p", { class: "dim" }, "Nothing was asked for yet.");
+    keep(this.jobs, jobs.length ? jobs.map((now) => this.row(now, chosen)) : [this.nothing]);
+    const told = JSON.stringify([view, runs.map(({ name, step, steps, best, problem }) => [name, step, steps, best, problem]), evaluations.length, chosen]);
+    if (told === this.told) return;
+    this.told = told;
+    const results = { demo: () => [], train: () => this.runsOf(runs, chosen), evaluate: () => this.evaluationsOf(evaluations, chosen) };
     const focused = document.activeElement?.dataset.key;
-    this.jobs.replaceChildren(...(jobs.length ? jobs.map((now) => this.row(now, chosen)) : [h("p", { class: "dim" }, "Nothing was asked for yet.")]));
-    const results = { demo: () => [], train: () => this.runsOf(runs, jobs, chosen), evaluate: () => this.evaluationsOf(evaluations, chosen) };
     this.results.replaceChildren(...results[view]());
     if (focused) document.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus();
   }
 
+  // Built anew where more than its progress has changed.
   row(now, chosen) {
-    const { job, standing, progress } = now;
-    const isHere = chosen.job === job.job_id;
+    const isHere = chosen.job === now.job.job_id;
+    const told = JSON.stringify([now.standing, isHere]);
+    let row = this.rows.get(now.job.job_id);
+    if (row?.told !== told) {
+      const progress = h("div", { class: "how-far" });
+      row = { told, progress, element: this.built(now, progress, isHere) };
+      this.rows.set(now.job.job_id, row);
+    }
+    row.progress.replaceChildren(...[progressOf(now)].filter(Boolean));
+    return row.element;
+  }
+
+  built(now, progress, isHere) {
+    const { job, standing } = now;
     return h("article", { class: `job ${standing.state}${isHere ? " here" : ""}`, "data-job": job.job_id },
-      h("button", { class: "name", "data-key": job.job_id, "aria-current": isHere ? "true" : null, onclick: () => this.act.open(now) },
+      h("button", { class: "name", "aria-current": isHere ? "true" : null, onclick: () => this.act.open(job.job_id) },
         h("i", { "aria-hidden": "true" }, SIGNS[standing.state]), h("b", {}, job.title), sweptOf(job)),
       h("span", { class: "state", title: standing.why }, standing.state),
       h("span", { class: "when", title: exactDate(job.created) }, `${date(job.created)} · ${job.author} · ${placeOf(job)}`),
-      progressOf(now),
+      progress,
       standing.why && h("p", { class: "why" }, standing.why),
       h("div", { class: "acts" }, this.actsOf(now)));
   }
@@ -76,7 +91,7 @@ export class JobList {
     return dialog.showModal();
   }
 
-  runsOf(runs, jobs, chosen) {
+  runsOf(runs, chosen) {
     if (!runs.length) return [];
     return [h("div", { class: "title" }, h("h2", {}, "Runs"), h("small", { class: "dim" }, "tick several to compare their curves")),
       h("table", {}, h("thead", {}, h("tr", {}, ["", "Run", "Step", "Loss on others"].map((text) => h("th", {}, text)))),
@@ -103,7 +118,7 @@ export class JobList {
 
 export const interval = ([low, high]) => `${Math.round(100 * low)}–${Math.round(100 * high)} %`;
 
-const sweptOf = ({ swept }) => Object.entries(swept).flatMap(([name, value]) => [" ", h("span", { class: "tag" }, `${titleOf(name)} ${value}`)]);
+const sweptOf = ({ swept }) => Object.entries(swept).flatMap(([name, value]) => [" ", h("span", { class: "tag" }, `${titleOf(name)} ${valueOf(value)}`)]);
 
 const WHAT = { train: "steps", evaluate: "rollouts", demo: "takes", export: "%" };
 

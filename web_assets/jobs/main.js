@@ -7,7 +7,7 @@ import { attempt, h } from "../dataset/dom.js";
 import { DemoForm } from "./demo_form.js";
 import { EvaluateForm } from "./evaluate_form.js";
 import { EvaluationView } from "./evaluation_view.js";
-import { link } from "./fields.js";
+import { author, link } from "./fields.js";
 import { JobList } from "./job_list.js";
 import { RunView } from "./run_view.js";
 import { TrainForm } from "./train_form.js";
@@ -21,27 +21,35 @@ const page = { view: "train", job: null, runs: [], evaluation: null, against: nu
 let jobs = [], runs = [], evaluations = [], looks = 0;
 
 const list = new JobList(at("jobs"), {
-  open: (job) => go({ job: job.job.job_id, runs: job.job.kind === "train" ? [job.job.subject] : [], evaluation: evaluationOf(job), against: null }),
+  open: (id) => open(jobs.find(({ job }) => job.job_id === id)),
   openRun: (name, isMore) => go({ job: null, runs: isMore ? toggled(page.runs, name) : [name], evaluation: null }),
   openEvaluation: (id) => go({ job: null, runs: [], evaluation: id, against: null }),
   openSweep: (name) => go({ job: null, runs: jobs.filter(({ job }) => job.sweep === name).map(({ job }) => job.subject), evaluation: null }),
   again: (job) => again(job),
-  changed: () => look(true),
+  changed: () => attempt(() => look(true)),
 });
 const forms = {
   demo: new DemoForm({ started }),
   train: new TrainForm({ started, demonstrate: (task) => { go({ view: "demo" }); forms.demo.choose(task); } }),
   evaluate: new EvaluateForm({ started }),
 };
-const runView = new RunView(at("closer"), { evaluate: (name) => { go({ view: "evaluate" }); forms.evaluate.choose(name); } });
+const runView = new RunView(at("closer"), {
+  evaluate: (name) => { go({ view: "evaluate" }); forms.evaluate.choose(name); },
+  changed: () => attempt(() => look(true)),
+  train: (task) => { go({ view: "train" }); forms.train.choose(task); },
+});
 const evaluationView = new EvaluationView(at("closer"), { against: (id) => go({ against: id }) });
 
 const toggled = (names, name) => (names.includes(name) ? names.filter((other) => other !== name) : [...names, name]);
 const evaluationOf = (job) => job.progress?.result?.evaluation ?? null;
 
-function started(job) {
-  go({ job: job.job.job_id, runs: job.job.kind === "train" ? [job.job.subject] : [], evaluation: null, against: null });
-  look(true);
+function open(now) {
+  go({ job: now.job.job_id, runs: now.job.kind === "train" ? [now.job.subject] : [], evaluation: evaluationOf(now), against: null });
+}
+
+function started(now) {
+  open(now);
+  attempt(() => look(true));
 }
 
 // The form as that job was asked for, to ask again with changes.
@@ -75,7 +83,7 @@ function show() {
     evaluationView.show({ id: page.evaluation ?? (job && evaluationOf(job)), against: page.against, job, evaluations });
   } else {
     evaluationView.close();
-    runView.show({ names: page.runs, job, runs, jobs });
+    runView.show({ names: page.runs, job, runs, jobs, evaluations });
   }
 }
 
@@ -88,6 +96,7 @@ async function look(isNow = false) {
   if (ended || isNow || looks % SELDOM === 0) {
     [runs, evaluations] = await Promise.all([api.get("/runs"), api.get("/evaluations")]);
   }
+  if (ended && looks) attempt(() => forms.train.refresh());
   looks += 1;
   show();
 }
@@ -124,5 +133,6 @@ go({
   against: given.get("against"),
 });
 if (given.get("collection")) forms.train.chooseCollection(given.get("collection"));
+attempt(async () => { author.known = (await api.get("/me")).name; });
 attempt(() => Promise.all(Object.values(forms).map((form) => form.load()))).then(keepLooking);
-document.addEventListener("visibilitychange", () => { if (!document.hidden) attempt(() => look(true)); });
+document.addEventListener("visibilitychange", () => { if (!document.hidden) attempt(() => Promise.all([look(true), forms.train.refresh()])); });

@@ -3,7 +3,7 @@
 import { h } from "../dataset/dom.js";
 import { field, numberOf, select } from "./fields.js";
 
-const HERE = "local";
+export const HERE = "local";
 const ADDRESS = "studio.cluster"; // the last one, in the browser's storage
 
 export class Place {

@@ -4,6 +4,7 @@ import { api } from "../dataset/api.js";
 import { attempt, h, toast } from "../dataset/dom.js";
 import { author, duration, field, fieldOf, numberOf, select, setOptions } from "./fields.js";
 import { Place } from "./place.js";
+import { Sweep } from "./sweep.js";
 
 const FIRST = ["preset", "policy", "images", "wrench", "steps"]; // the rest is folded away by its headings
 const EXAMINED = 1000; // takes at most, whose health is told
@@ -23,8 +24,7 @@ export class TrainForm {
     this.first = h("input", { type: "text", name: "episodes", inputmode: "numeric", placeholder: "all" });
     this.name = h("input", { type: "text", name: "name", placeholder: "task, policy and time", spellcheck: false });
     this.place = new Place({ processes: true });
-    this.sweepBy = select("sweep", [["", "no sweep"]], () => { this.sweepValues.hidden = !this.sweepBy.value; });
-    this.sweepValues = h("input", { type: "text", name: "sweep_values", placeholder: "values, e.g. 1e-4, 5e-4", hidden: true });
+    this.sweep = new Sweep();
     this.count = h("p", { class: "count", role: "status" });
     this.time = h("p", { class: "count", role: "status" });
     this.byFilter = h("div", { class: "pairs" }, field("Operator", this.operator), field("Agent", this.agent), field("Quality", this.quality), field("First so many", this.first));
@@ -34,7 +34,7 @@ export class TrainForm {
     this.element = h("form", { onsubmit: (event) => { event.preventDefault(); attempt(() => this.start()); } },
       h("h2", {}, "Takes"), field("Task", this.task), field("From", this.source), this.byCollection, this.byFilter, this.count,
       h("h2", {}, "Policy"), this.settings,
-      h("h2", {}, "Run"), field("Name", this.name), field("Sweep over", this.sweepBy), this.sweepValues, this.place.element,
+      h("h2", {}, "Run"), field("Name", this.name), this.sweep.element, this.place.element,
       this.time,
       h("div", { class: "buttons" }, h("button", { type: "button", onclick: () => attempt(() => this.estimate()) }, "Estimate time"), this.button));
   }
@@ -57,15 +57,31 @@ export class TrainForm {
     this.fields.preset.element.querySelector("select").addEventListener("change", () => this.usePreset());
     this.settings.addEventListener("input", () => { this.time.textContent = ""; });
     this.usePreset("small");
-    const sweepable = Object.entries(properties).filter(([name, { enum: values, type }]) => values || type !== "boolean" && !["preset", "device"].includes(name));
-    setOptions(this.sweepBy, [["", "no sweep"], ...sweepable.map(([name, { title, flag }]) => [name, `${title} ${flag}`])]);
+    this.sweep.load(Object.fromEntries(Object.entries(properties).filter(([name]) => name !== "preset" && !form.machine.includes(name))));
     setOptions(this.task, tasks.map(({ task }) => [task, task]));
-    setOptions(this.collection, collections.map(({ name, members }) => [name, `${name} (${members.length})`]));
+    this.offer(collections);
     const { task } = await api.get("/facets");
     const most = Object.entries(task).sort((a, b) => b[1] - a[1])[0];
     if (most) this.task.value = most[0];
     if (this.wanted) this.chooseCollection(this.wanted);
     await this.chosen();
+  }
+
+  offer(collections) {
+    setOptions(this.collection, collections.map(({ name, members }) => [name, `${name} (${members.length})`]));
+  }
+
+  // There may be other takes and collections by now.
+  async refresh() {
+    if (!this.presets) return; // not loaded yet
+    this.offer(await api.get("/collections"));
+    await this.chosen();
+  }
+
+  choose(task) {
+    this.task.value = task;
+    this.source.value = "filter";
+    this.chosen();
   }
 
   chooseCollection(name) {
@@ -156,14 +172,13 @@ export class TrainForm {
   async start() {
     this.button.disabled = true;
     try {
-      const body = this.body(), by = this.sweepBy.value;
-      if (by) {
-        const values = this.sweepValues.value.split(",").map((text) => text.trim()).filter(Boolean).map((text) => (Number.isFinite(Number(text)) ? Number(text) : text));
-        const found = await api.post("/sweeps", { job: body, fields: { [by]: values } });
-        toast(`${found.length} runs are queued.`);
+      const job = this.body(), fields = this.sweep.read();
+      if (fields) {
+        const found = await api.post("/sweeps", { job, fields });
+        toast(`${found.length} ${found.length === 1 ? "run is" : "runs are"} queued.`);
         this.started(found[0]);
       } else {
-        this.started(await api.post("/jobs", body));
+        this.started(await api.post("/jobs", job));
       }
       this.name.value = "";
     } finally {
