@@ -193,7 +193,11 @@ def _evaluate(studio: Any, where: Where, arguments: Sequence[str]) -> Request:
     from studio.jobs import plans
 
     given = _parsed("evaluate", policies.evaluate, arguments)
-    _refuse(given, seeds=None, compare=None)
+    _refuse(given, compare=None)
+    seeds = policies.seeds_of(given["seeds"], given["seed"], given["episodes"])
+    if not seeds or seeds != tuple(range(seeds[0], seeds[0] + len(seeds))):
+        raise ValueError(f"A job takes seeds that follow each other, like 1000:1020, not {given['seeds']!r}.")
+    given |= {"seed": seeds[0], "episodes": len(seeds)}
     names = ("task", "seed", "episodes", "workers", "hide", "execution", "replan_every", "latency", "device")
     asked = {name: given[name] for name in (*names, "spread", "stiffness_table", "cameras")}
     return plans.evaluate(studio.catalog, where, given["agent"], **asked)
@@ -226,9 +230,8 @@ def _demo(studio: Any, where: Where, arguments: Sequence[str]) -> Request:
     from studio.jobs import plans
 
     given = _parsed("demo", recording.demo, arguments)
-    _refuse(given, stiffness_table="tuned")
-    asked = {name: given[name] for name in ("episodes", "seed", "workers", "cameras", "spread")}
-    return plans.demo(studio.catalog, where, given["task"], **asked)
+    names = ("episodes", "seed", "workers", "cameras", "spread", "stiffness_table")
+    return plans.demo(studio.catalog, where, given["task"], **{name: given[name] for name in names})
 
 
 REQUESTS: dict[str, Callable[[Any, Where, Sequence[str]], Request]] = {

@@ -168,7 +168,7 @@ def evaluate(
     plan = Plan.of(
         agent,
         task,
-        _seeds(seeds, seed, episodes),
+        seeds_of(seeds, seed, episodes),
         data,
         hide=hide,
         execution=execution,
@@ -331,7 +331,7 @@ def policy_server(
     return 0
 
 
-def _seeds(text: str | None, first: int, count: int) -> tuple[int, ...]:
+def seeds_of(text: str | None, first: int, count: int) -> tuple[int, ...]:
     """From 1000:1020 or 3,5,8; else `count` seeds from `first` on."""
     try:
         if text is None:
