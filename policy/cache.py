@@ -50,8 +50,11 @@ def build(
                     writer.add(recording)
                     on_take(recording.name)
         writer.finish(part)
-        if not folder.exists():  # another process may have been faster
+        try:
             part.rename(folder)
+        except OSError:
+            if not folder.exists():  # else another process was faster
+                raise
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
@@ -78,6 +81,10 @@ class _Writer:
         times = start + GRID * np.arange(int((end - start) / GRID + 1e-6) + 1)
         names = self._cameras
         images = {name: recording.image_times(name) for name in names}
+        if dark := [name for name, shown in images.items() if not len(shown)]:
+            raise ValueError(
+                f"{recording.name} has no image of {', '.join(dark)}; leave it out, or train --no-images."
+            )
         rows, chosen = _pair(times, images, recording.span[0])
         if len(rows) < 2:
             first, last = recording.span
@@ -168,7 +175,7 @@ def _pair(times: Array, images: dict[str, Array], begin: float) -> tuple[Array, 
     fits = (rows >= 0) & (rows < len(times)) & (shown >= begin - NANOSECOND)
     chosen = {}
     for camera, others in images.items():
-        nearest = np.abs(others[None] - shown[:, None]).argmin(1)
+        nearest = _nearest(others, shown)
         fits &= np.abs(others[nearest] - shown) < PAIRED
         chosen[camera] = nearest
     return rows[fits], {camera: nearest[fits] for camera, nearest in chosen.items()}
@@ -194,6 +201,13 @@ def _on_grid(track: ArmTrack, times: Array) -> dict[str, Array]:
 def _newest(known: Array, times: Array) -> Array:
     """(n,) index of the last of rising `known` at or before each of `times`, else of the first."""
     return np.maximum(np.searchsorted(known, times + 10 * NANOSECOND, side="right") - 1, 0)
+
+
+def _nearest(known: Array, times: Array) -> Array:
+    """(n,) index of the one of rising `known` next to each of `times`, of two the earlier."""
+    after = np.searchsorted(known, times).clip(max=len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(times - known[before] <= np.abs(known[after] - times), before, after)
 
 
 def _rate(times: Array) -> float:

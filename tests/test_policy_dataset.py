@@ -145,6 +145,15 @@ def test_a_dead_sensor_is_refused_by_name(tmp_path: Path) -> None:
         dataset_of(tmp_path / "cache", Synthetic("a"), Dead("b"))
 
 
+def test_a_camera_without_images_is_named(tmp_path: Path) -> None:
+    class Dark(Synthetic):
+        def image_times(self, camera: str) -> np.ndarray:
+            return super().image_times(camera)[: 0 if camera == "wrist" else None]
+
+    with pytest.raises(ValueError, match="b has no image of wrist"):
+        dataset_of(tmp_path / "cache", Synthetic("a"), Dark("b"))
+
+
 def test_takes_driven_by_joints_teach_no_compliance(tmp_path: Path) -> None:
     class Joints(Synthetic):
         def track(self, arm: str):
