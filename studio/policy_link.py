@@ -15,6 +15,7 @@ import secrets
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -103,7 +104,11 @@ class RemotePolicy:
             ) from error
         except (OSError, websockets.exceptions.WebSocketException) as error:
             raise ConnectionError(f"No policy answers at {address}: {error}") from error
-        hello = self._receive()
+        try:
+            hello = self._receive()
+        except msgspec.DecodeError as error:
+            self._link.close()
+            raise ConnectionError(f"{address} speaks another version of the studio: {error}") from error
         assert isinstance(hello, Hello)
         self.spec = hello.spec
 
@@ -212,10 +217,11 @@ def serve_policy(
 ) -> None:
     """Load the policy of a run or checkpoint and answer until Ctrl-C, or until the first client has left."""
     policy = load_policy(run, device=device, hide_images="images" in hide, hide_wrench="wrench" in hide)
-    token = os.environ.get(TOKEN) or secrets.token_urlsafe()
+    given = os.environ.get(TOKEN)
+    token = given or secrets.token_urlsafe()
     with PolicyServer(policy, token, host, port) as server:
         tell(f"{ANSWERS_AT}{server.address} with {policy.spec.run} after {policy.spec.step} steps.")
-        if TOKEN not in os.environ:
+        if not given:
             tell(f"{TOKEN}={token}")
         server.left.wait() if once else threading.Event().wait()
 
@@ -227,9 +233,9 @@ def is_address(text: str) -> bool:
 
 def connect_to(address: str) -> RemotePolicy:
     """A policy server whose token is in the environment. Raises ConnectionError where it is not."""
-    if TOKEN not in os.environ:
+    if not (token := os.environ.get(TOKEN)):
         raise ConnectionError(f"Set {TOKEN} to the token that the policy server at {address} printed.")
-    return RemotePolicy(address, os.environ[TOKEN])
+    return RemotePolicy(address, token)
 
 
 def start(run: Path, *, options: Sequence[str] = ()) -> RemotePolicy:
@@ -265,7 +271,7 @@ def _address_from(child: subprocess.Popen[str]) -> str:
     assert child.stdout
     given_up = threading.Timer(START_TIMEOUT, child.kill)
     given_up.start()
-    said = "it said nothing"
+    said, begun = "it said nothing", time.monotonic()
     try:
         for line in child.stdout:
             if line.startswith(ANSWERS_AT):
@@ -273,7 +279,12 @@ def _address_from(child: subprocess.Popen[str]) -> str:
             said = line.strip() or said
     finally:
         given_up.cancel()
-    raise RuntimeError(f"The policy process ended at once: {said}")
+    when = (
+        f"was ended after {START_TIMEOUT:.0f} s"
+        if time.monotonic() - begun > START_TIMEOUT
+        else "ended at once"
+    )
+    raise RuntimeError(f"The policy process {when}: {said}")
 
 
 # Between arrays and messages

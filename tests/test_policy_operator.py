@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 import websockets.sync.client
+import websockets.sync.server
 from agents import Listener
 from policies import SPEC, SPEED, Riser
 from test_live import Stage
@@ -264,6 +265,19 @@ def test_anything_else_is_refused(message: bytes, inputs: Inputs) -> None:
         remote = RemotePolicy(server.address, TOKEN)
         assert remote.predict(inputs).time == 0.25
         remote.close()
+
+
+def test_a_server_of_another_version_is_told() -> None:
+    def greet(link: websockets.sync.server.ServerConnection) -> None:
+        link.send(msgspec.msgpack.encode({"type": "Hello", "spec": {"run": "riser", "task": "wiping"}}))
+
+    with websockets.sync.server.serve(greet, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        with pytest.raises(ConnectionError, match="speaks another version of the studio"):
+            RemotePolicy(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", TOKEN)
+        server.shutdown()
+        thread.join()
 
 
 def test_a_server_that_goes_is_told(inputs: Inputs) -> None:
