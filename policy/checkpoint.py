@@ -15,11 +15,14 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from controller.stiffness import StiffnessTable
 from policy.config import TrainConfig
 from policy.features import Control, Features
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FORMAT = 1
 CHECKPOINTS, CONFIG = "checkpoints", "config.json"  # in the folder of a run
@@ -125,6 +128,17 @@ def read(folder: Path) -> Checkpoint:
 def read_spec(run_or_checkpoint: Path) -> PolicySpec:
     """What a policy needs and commands, without loading it."""
     return read(find(run_or_checkpoint)).spec
+
+
+def read_tensors(folder: Path, file: str) -> dict[str, Tensor]:
+    """Of `MODEL` or `TRAINING` of a checkpoint. Raise ValueError where it cannot be read. Loads torch."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(folder / file)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{folder / file} cannot be read: {error}.") from error
 
 
 def write(run: Path, checkpoint: Checkpoint, files: Mapping[str, bytes], *, is_best: bool) -> Path:

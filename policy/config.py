@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -110,7 +111,9 @@ class TrainConfig:
         for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise ValueError(f"{_flag(name)} must be at least 1, not {getattr(self, name)}.")
-        for name in ("warm_up", "shift", "threads", "weight_decay", "kl_weight", *_WEIGHTS):
+        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
+            raise ValueError(f"--device is auto, cpu, cuda or cuda:N, not {self.device!r}.")
+        for name in ("seed", "warm_up", "shift", "threads", "weight_decay", "kl_weight", *_WEIGHTS):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{_flag(name)} must not be negative, but is {getattr(self, name)}.")
         for name in ("dropout", "state_dropout", "ema", "validation", "brightness"):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file
 
 from controller.types import Array
 from policy import checkpoint
@@ -59,9 +58,10 @@ def load(
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise RuntimeError(f"No GPU for device {device!r}: torch finds none here; use cpu.")
     torch.set_num_threads(threads)
+    tensors = checkpoint.read_tensors(folder, checkpoint.MODEL)
     model = Act.of(told.config, told.features.encoding, told.spec.cameras)
     try:
-        model.load_state_dict(load_file(folder / checkpoint.MODEL))
+        model.load_state_dict(tensors)
     except RuntimeError as error:
         raise ValueError(f"{folder} does not fit this version: {error}") from error
     policy = ActPolicy(told, model.to(device).eval(), device)

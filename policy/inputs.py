@@ -50,7 +50,11 @@ class History:
             self._states.popleft()
 
     def inputs(self, observation: Observation) -> Inputs | None:
-        """For the policy, once `observation` was added; None while a camera has no image yet."""
+        """For the policy, once `observation` was added.
+
+        None while a camera has no image yet, or its newest shows a moment whose state is not remembered: one
+        before the first `add`, or too long ago.
+        """
         if missing := [name for name in self._spec.cameras if name not in observation.images]:
             if len(observation.images):
                 have = sorted(observation.images)
@@ -59,8 +63,10 @@ class History:
         images = {name: observation.images[name] for name in self._spec.cameras}
         time = min((image.time for image in images.values()), default=observation.time)
         times = np.array([at for at, _ in self._states])
+        if time < times[0] - NANOSECOND * 10:
+            return None
         back = np.arange(max(self._spec.wrench_history, 1) - 1, -1, -1) / self._spec.wrench_rate
-        # Before the first state the first stands for all.
+        # Forces of before the first state: it stands for all.
         chosen = np.searchsorted(times, time - back + NANOSECOND * 10, side="right") - 1
         rows = np.stack([self._states[max(int(n), 0)][1] for n in chosen])  # (samples, arms, 20)
         pose, q, gripper, _ = np.split(rows[-1], [7, 13, 14], axis=1)

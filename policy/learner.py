@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -28,12 +28,16 @@ from policy.checkpoint import Checkpoint, PolicySpec
 from policy.config import TrainConfig
 from policy.dataset import Dataset
 from policy.features import Features
-from policy.machine import Machine
+from policy.machine import Machine, is_finite
 from policy.vision import ResNet18
 
 VALIDATED = 128  # samples at most, evenly over the takes kept aside
 METRICS = "metrics.jsonl"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of AdamW
+
+
+class Diverged(RuntimeError):
+    """A loss, a gradient or weights that are not finite; the checkpoints before it are good."""
 
 
 class Learner:
@@ -113,12 +117,15 @@ class Learner:
                 for mean, weight in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
                     mean.lerp_(weight, 1.0 - decay)
 
-    def is_due(self, every: int, stopping: bool) -> bool:
+    def is_due(self, every: int) -> bool:
         """At the end of a run, too."""
-        return stopping or self.step % every == 0 or self.step == self.config.steps
+        return self.step % every == 0 or self.step == self.config.steps
 
-    def what_diverged(self, loss: Tensor, norm: Tensor, samples: Array) -> str:
-        return (
+    def check_finite(self, loss: Tensor, norm: Tensor, samples: Array) -> None:
+        """Raise `Diverged` where a step's loss or gradient norm is not, before it changes any weight."""
+        if is_finite(loss, norm):
+            return
+        raise Diverged(
             f"Step {self.step + 1} has loss {loss.item():g} and a gradient of {norm.item():g}: not finite. "
             f"Its batch: {self.dataset.describe(samples)}. The last checkpoint is good; try a smaller --lr."
         )
@@ -210,10 +217,14 @@ class Learner:
     def save(self) -> Path:
         """A checkpoint of this step; the last, and the best where the last validation was.
 
-        Raises FileNotFoundError where somebody removed the run meanwhile.
+        Raises FileNotFoundError where somebody removed the run meanwhile, `Diverged` where weights or moments
+        are not finite any more: then the checkpoint before stays the last.
         """
         if not (self.run / checkpoint.CONFIG).exists():
             raise FileNotFoundError(f"Somebody removed {self.run / checkpoint.CONFIG} while the run learned.")
+        state = self._training_state()
+        if not is_finite(*state.values()):
+            raise Diverged(f"After step {self.step} the weights are not finite; try a smaller --lr.")
         config, encoding = self.config, self.features.encoding
         spec = PolicySpec(
             run=self.run.name,
@@ -240,7 +251,7 @@ class Learner:
         )
         files = {
             checkpoint.MODEL: save(_on_cpu(self.averaged.state_dict())),
-            checkpoint.TRAINING: save(_on_cpu(self._training_state())),
+            checkpoint.TRAINING: save(_on_cpu(state)),
         }
         is_best, self.is_best = self.is_best, False
         return checkpoint.write(self.run, told, files, is_best=is_best)
@@ -254,10 +265,15 @@ class Learner:
 
     def _restore(self, told: Checkpoint, folder: Path) -> None:
         self.step, self.best, self._validation = told.spec.step, told.best, told.validation
-        self.averaged.load_state_dict(load_file(folder / checkpoint.MODEL))  # the raw weights come after
-        state = load_file(folder / checkpoint.TRAINING)
+        averaged, state = (
+            checkpoint.read_tensors(folder, f) for f in (checkpoint.MODEL, checkpoint.TRAINING)
+        )
         weights = {name: value for name, value in state.items() if name.startswith("weight/")}
-        self.model.load_state_dict({name.removeprefix("weight/"): value for name, value in weights.items()})
+        try:
+            self.averaged.load_state_dict(averaged)  # the raw weights come after
+            self.model.load_state_dict({name.removeprefix("weight/"): w for name, w in weights.items()})
+        except RuntimeError as error:
+            raise ValueError(f"{folder} does not fit this version: {error}") from error
         for name, parameter in self.model.named_parameters():
             kept: dict[str, Tensor] = {"step": torch.tensor(float(self.step), device=parameter.device)}
             for moment in MOMENTS:  # in the memory layout of the weight, which the fused step relies on

@@ -68,7 +68,7 @@ def machine(device: str, threads: int) -> Iterator[Machine]:
     if threads:
         torch.set_num_threads(threads)
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    chosen = _device(device, int(os.environ.get("LOCAL_RANK", 0)))
+    chosen = device_of(device, int(os.environ.get("LOCAL_RANK", 0)))
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
         torch.set_float32_matmul_precision("high")
@@ -82,7 +82,8 @@ def machine(device: str, threads: int) -> Iterator[Machine]:
         distributed.destroy_process_group()
 
 
-def _device(name: str, local_rank: int) -> torch.device:
+def device_of(name: str, local_rank: int = 0) -> torch.device:
+    """What cpu, cuda, cuda:N or auto means here. Raises RuntimeError where there is no such GPU."""
     there = torch.cuda.is_available()
     if name == "auto":
         name = "cuda" if there else "cpu"

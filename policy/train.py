@@ -16,14 +16,12 @@ from torch import nn
 
 from policy.config import TrainConfig
 from policy.dataset import Dataset
-from policy.learner import Learner
-from policy.machine import StopRequest, is_finite, machine
+from policy.learner import Diverged, Learner
+from policy.machine import StopRequest, machine
+
+__all__ = ["Diverged", "TrainResult", "train"]
 
 Tell = Callable[[Mapping[str, float]], None]
-
-
-class Diverged(RuntimeError):
-    """A loss or gradient that is not finite; the checkpoints before it are good."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +46,8 @@ def train(
 ) -> TrainResult:
     """Learn from a dataset, or go on from the last checkpoint in `run`. One call per process of the run.
 
-    `tell` is told the metrics of each step. SIGTERM makes it save and return. Raises `Diverged`; ValueError
-    where the run to go on with had other settings or other takes.
+    `tell` is told the metrics of each step. SIGTERM makes it save at once and return. Raises `Diverged`;
+    ValueError where the run to go on with had other settings or other takes.
     """
     with machine(config.device, config.threads) as here, StopRequest() as stop:
         return _learn(Learner.begin(config, dataset, run, here, resume=resume), stop, tell)
@@ -65,8 +63,7 @@ def _learn(learner: Learner, stop: StopRequest, tell: Tell) -> TrainResult:
                 told = learner.objective(batch.to(here.device))
             told["loss"].backward()
             norm = nn.utils.clip_grad_norm_(learner.model.parameters(), config.clip)
-            if not is_finite(told["loss"], norm):
-                raise Diverged(learner.what_diverged(told["loss"], norm, samples))
+            learner.check_finite(told["loss"], norm, samples)
             learner.optimizer.step()
             learner.average()
             learner.step += 1
@@ -75,10 +72,10 @@ def _learn(learner: Learner, stop: StopRequest, tell: Tell) -> TrainResult:
             stopping = here.any(stop.asked)
             if here.leads:
                 metrics |= {"lr": learner.lr, "gradient": norm.item(), "seconds": time.monotonic() - began}
-                metrics |= learner.validate() if learner.is_due(config.validate_every, stopping) else {}
+                metrics |= learner.validate() if learner.is_due(config.validate_every) else {}
                 note({"step": learner.step, **metrics})
                 tell({"step": learner.step, **metrics})
-                if learner.is_due(config.save_every, stopping) or learner.is_best:
+                if stopping or learner.is_best or learner.is_due(config.save_every):
                     learner.save()
             if stopping:
                 break

@@ -167,6 +167,7 @@ class Studio:
         on_step: Callable[[Mapping[str, float]], None] = lambda metrics: None,
     ) -> TrainResult:
         """Read the takes of a run, then let it learn until it is finished, or SIGTERM or SIGINT comes."""
+        training.check_device(run)
         dataset = training.dataset_of(self.catalog, run, on_take)
         return training.train(run, dataset, on_step=on_step)
 

@@ -170,6 +170,13 @@ def lay_out(run: Run, asked: Mapping[str, Any]) -> None:
     (run.folder / CONFIG).write_text(json.dumps(told, indent=1))
 
 
+def check_device(run: Run) -> None:
+    """Raise RuntimeError where a run asks for a GPU and there is none, before it begins. Loads torch."""
+    from policy.machine import device_of
+
+    device_of(run.config.device)
+
+
 def dataset_of(catalog: Catalog, run: Run, on_take: Callable[[str], None] = lambda name: None) -> Dataset:
     """The cache of a run's takes, read once; `on_take` hears of each take as it is read.
 

@@ -191,6 +191,8 @@ def test_resnet_reads_torchvisions_file(tmp_path: Path) -> None:
         ({"width": 30}, "multiple of 4 and of --heads"),
         ({"rate": 200.0}, "above the 100 Hz"),
         ({"backbone_weights": "x.pth"}, "needs --backbone resnet18"),
+        ({"seed": -1}, "--seed must not be negative"),
+        ({"device": "gpu"}, "--device is auto, cpu, cuda or cuda:N, not 'gpu'"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(wrong: dict[str, object], why: str) -> None:
