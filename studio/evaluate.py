@@ -10,7 +10,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -261,31 +261,41 @@ def _rollouts(plan: Plan, data_dir: Path, evaluation_id: str, workers: int) -> I
             for seed in plan.seeds:
                 yield _roll_out(station, opened, plan, evaluation_id, seed)
         return
-    with ProcessPoolExecutor(
-        min(workers, len(plan.seeds)), get_context("spawn"), _prepare, (plan, data_dir, evaluation_id)
-    ) as pool:
-        seeds: dict[Future[_Done], int] = {pool.submit(_roll_out_here, seed): seed for seed in plan.seeds}
+
+    def pool(size: int) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(size, get_context("spawn"), _prepare, (plan, data_dir, evaluation_id))
+
+    lost = []
+    with pool(min(workers, len(plan.seeds))) as side_by_side:
+        seeds = {side_by_side.submit(_roll_out_here, seed): seed for seed in plan.seeds}
         try:
             for future in as_completed(seeds):
                 try:
                     yield future.result()
-                except BrokenProcessPool as error:
-                    yield _Done(Rollout(seeds[future], False, error=f"A worker process died: {error}"))
+                except BrokenProcessPool:
+                    lost.append(seeds[future])
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)  # interrupted: the other seeds need not come
+            side_by_side.shutdown(wait=False, cancel_futures=True)  # interrupted: the others need not come
+    for seed in lost:  # a process that dies takes the pool along; who killed it shows alone
+        with pool(1) as alone:
+            try:
+                yield alone.submit(_roll_out_here, seed).result()
+            except BrokenProcessPool as error:
+                yield _Done(Rollout(seed, False, error=f"Its process died: {error}"))
 
 
 def _roll_out(
     station: Station, opened: Callable[[], _MakeAgent], plan: Plan, evaluation_id: str, seed: int
 ) -> _Done:
     feel, begun = Feel(), time.monotonic()
+    make = opened()  # a policy that cannot be loaded ends the evaluation: it would fail in every scene
     agent: Agent | None = None
 
     def make_agent(twin: Twin) -> Agent:
         nonlocal agent
         if plan.sees and station.camera_error:
             raise RuntimeError(station.camera_error)
-        agent = opened()(twin)
+        agent = make(twin)
         return UntilDone(agent, twin)
 
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from policy.agent import History, Inputs, Policy, load_policy
 from studio import references, tasks
 from studio.api import Studio
 from studio.evaluate import Plan
-from studio.evaluation import Evaluation, compare, load, mcnemar, wilson
+from studio.evaluation import Evaluation, Rollout, compare, load, mcnemar, wilson
 from studio.policy_link import TOKEN, PolicyServer, start
 from studio.references import REFERENCES, demonstrated, smooth_errors
 from studio.tasks import wiping
@@ -183,6 +184,21 @@ def test_errors_are_not_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert len(studio.episodes(outcome="unmarked")) == 2
 
 
+def test_workers_find_the_same_also_where_one_of_them_dies(tmp_path: Path, demonstrator: Evaluation) -> None:
+    def kill_one(rollout: Rollout) -> None:
+        for worker in multiprocessing.active_children()[:1]:
+            worker.kill()
+
+    seeds = tuple(rollout.seed for rollout in demonstrator.rollouts)
+    with Studio(tmp_path) as studio:
+        plan = Plan(agent="demonstrator", task="wiping", seeds=seeds)
+        found = studio.evaluate(plan, workers=2, on_rollout=kill_one)
+    same = {"episode_id": "", "wall_seconds": 0.0}
+    for one, other in zip(found.rollouts, demonstrator.rollouts, strict=True):
+        assert dataclasses.replace(one, **same) == dataclasses.replace(other, **same)
+    assert found.curves == demonstrator.curves
+
+
 def test_bad_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="demonstrator"):
         Plan.of("demonstrater", "wiping", (0,), tmp_path)
@@ -282,6 +298,11 @@ def test_a_run_is_evaluated_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     seeing, blind = load_policy(run), load_policy(run, hide_wrench=True)
     assert height(seeing, inputs) != height(seeing, pressed)
     assert height(blind, inputs) == height(blind, pressed)
+    with pytest.raises(RuntimeError, match="No GPU for device 'cuda'"), Studio(tmp_path) as studio:
+        studio.evaluate(dataclasses.replace(plan, device="cuda", seeds=(4, 5)))
+    assert (
+        len(list((tmp_path / "evaluations").iterdir())) == 1
+    )  # nothing is said about a policy that did not run
     remote = start(run)
     assert remote.spec == seeing.spec
     assert height(remote, pressed) == height(seeing, pressed)
