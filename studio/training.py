@@ -24,7 +24,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from controller.stiffness import StiffnessTable
 from controller.types import Array
@@ -66,6 +66,14 @@ class Chosen:
         return Chosen(fields["episode_id"], None if trim is None else (trim[0], trim[1]), version)
 
 
+class Choice(TypedDict, total=False):
+    """Which of a task's takes to learn from, see `prepare`."""
+
+    episodes: int | None
+    filters: Filters | None
+    collection: str | None
+
+
 @dataclass(frozen=True, slots=True)
 class Run:
     """Where a run lies and what it learns from; `prepare` makes one, `train` lets it learn."""
@@ -88,9 +96,7 @@ def prepare(
     config: TrainConfig,
     *,
     name: str | None = None,
-    episodes: int | None = None,
-    filters: Filters | None = None,
-    collection: str | None = None,
+    **choice: Unpack[Choice],
 ) -> Run:
     """A new run of successful demonstrations of a task, or of those that `filters` ask for.
 
@@ -107,7 +113,7 @@ def prepare(
     folder = catalog.data_dir / "runs" / name
     if folder.exists() and leads():
         raise ValueError(f"There is a run {name} already; resume it, or give another name.")
-    rows = choose(catalog, task, episodes=episodes, filters=filters, collection=collection)
+    rows = choose(catalog, task, **choice)
     takes = tuple(Chosen(row.episode_id, row.trim, row.edit_version) for row in rows)
     rollouts = tuple(row.episode_id for row in rows if not is_demonstration(row))
     return Run(folder, task, config, takes, rollouts=rollouts)

@@ -15,7 +15,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from controller.stiffness import StiffnessTable
 from policy import checkpoint
@@ -28,7 +28,7 @@ from studio.index import Filters
 from studio.jobs.job import LOCAL, Job, Kind, new_job_id
 from studio.jobs.queue import JobNow, Jobs, check_runner
 from studio.references import REFERENCES
-from studio.training import TAKES, Chosen, Run
+from studio.training import TAKES, Choice, Chosen, Run
 
 MOST_OF_A_SWEEP = 64  # jobs
 
@@ -89,16 +89,13 @@ def train(
     config: TrainConfig,
     *,
     name: str | None = None,
-    episodes: int | None = None,
-    filters: Filters | None = None,
-    collection: str | None = None,
+    **choice: Unpack[Choice],
 ) -> Request:
     """Learn a new run, of the takes that match now. Raises ValueError where none does."""
     tasks.load(task)
-    run = training.prepare(
-        catalog, task, config, name=name, episodes=episodes, filters=filters, collection=collection
-    )
-    asked = {"task": task, "episodes": episodes, "collection": collection, **_given(filters)}
+    run = training.prepare(catalog, task, config, name=name, **choice)
+    episodes, collection = choice.get("episodes"), choice.get("collection")
+    asked = {"task": task, "episodes": episodes, "collection": collection, **_given(choice.get("filters"))}
     return Request(
         run=run,
         origin={"author": where.author, "sweep": where.sweep, **asked},
