@@ -95,6 +95,10 @@ class JobsClient:
         """How long a run would take; itself takes seconds."""
         return self._client._post("/train-estimate", Estimate, {"task": task, **asked})
 
+    def references(self) -> list[str]:
+        """Agents that can be evaluated besides runs."""
+        return self._client._get("/references", list[str])
+
     def evaluation(self, evaluation_id: str) -> EvaluationDetails:
         return self._client._get(f"/evaluations/{quote(evaluation_id, safe='')}", EvaluationDetails)
 

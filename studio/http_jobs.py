@@ -23,7 +23,7 @@ from studio.http_wire import Body, FiltersIn, Name, Problem, as_json, refusals
 from studio.jobs import plans
 from studio.jobs.job import LOCAL, Job
 from studio.jobs.plans import Request, Where
-from studio.jobs.queue import JobNow
+from studio.jobs.queue import JobNow, Jobs
 
 REFUSED: dict[int | str, dict[str, Any]] = {
     404: {"model": Problem, "description": "There is no such job, run, take or collection"},
@@ -231,7 +231,14 @@ def written() -> Iterator[None]:
 
 
 def jobs_router(studio: Studio) -> APIRouter:
-    router, jobs = APIRouter(responses=REFUSED, tags=["jobs"]), studio.jobs
+    router = APIRouter(responses=REFUSED, tags=["jobs"])
+    router.include_router(_queue_router(studio))
+    router.include_router(_job_router(studio.jobs))
+    return router
+
+
+def _queue_router(studio: Studio) -> APIRouter:
+    router, jobs = APIRouter(), studio.jobs
 
     @router.get("/jobs", response_model=list[JobNow])
     def list_jobs(
@@ -257,6 +264,17 @@ def jobs_router(studio: Studio) -> APIRouter:
         """A job for each combination of some values; all of them are checked before the first is queued."""
         with written():
             return as_json([studio.submit(request) for request in body.requests(studio)], 201)
+
+    @router.get("/jobs-trash", response_model=list[Job])
+    def list_trash() -> Response:
+        """The deleted jobs, the newest first."""
+        return as_json(jobs.trash())
+
+    return router
+
+
+def _job_router(jobs: Jobs) -> APIRouter:
+    router = APIRouter()
 
     @router.get("/jobs/{job_id}", response_model=JobNow)
     def read_job(job_id: JobId) -> Response:
@@ -293,10 +311,5 @@ def jobs_router(studio: Studio) -> APIRouter:
         """Bring it back from the trash."""
         with refusals():
             return as_json(jobs.restore(job_id))
-
-    @router.get("/jobs-trash", response_model=list[Job])
-    def list_trash() -> Response:
-        """The deleted jobs, the newest first."""
-        return as_json(jobs.trash())
 
     return router

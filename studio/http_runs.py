@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
@@ -81,13 +82,14 @@ class Estimate:
 
 def runs_router(studio: Studio, reader: Reader) -> APIRouter:
     router = APIRouter(responses=REFUSED)
-    router.include_router(_runs_router(studio), tags=["runs"])
+    router.include_router(_runs_router(studio.data_dir), tags=["runs"])
+    router.include_router(_asking_router(studio), tags=["runs"])
     router.include_router(_evaluations_router(studio, reader), tags=["evaluations"])
     return router
 
 
-def _runs_router(studio: Studio) -> APIRouter:
-    router, reader, data_dir = APIRouter(), MetricsReader(), studio.data_dir
+def _runs_router(data_dir: Path) -> APIRouter:
+    router, reader = APIRouter(), MetricsReader()
 
     @router.get("/runs", response_model=list[RunInfo])
     def list_runs(task: Annotated[str, Query(max_length=200)] = "") -> Response:
@@ -124,6 +126,13 @@ def _runs_router(studio: Studio) -> APIRouter:
         with refusals():
             runs.restore(data_dir, name)
             return as_json(runs.load(data_dir, name))
+
+    return router
+
+
+def _asking_router(studio: Studio) -> APIRouter:
+    """What somebody wants to know who thinks of a run."""
+    router = APIRouter()
 
     @router.get("/train-settings")
     def read_settings() -> Response:

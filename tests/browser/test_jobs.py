@@ -17,7 +17,7 @@ from studio.api import Studio
 from studio.link import socket_path
 from studio.ui.remote import Remote
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 expect.set_options(timeout=30e3)  # [ms] for a page on a busy machine
 LONG = 240e3  # [ms] for a job on a busy machine
 SMALL = {"Width": "16", "Feedforward": "32", "Heads": "2", "Encoder layers": "1", "Decoder layers": "1"}
