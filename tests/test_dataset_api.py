@@ -10,8 +10,8 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+from http_site import Site, record
 from test_catalog import record as record_forces
-from test_http import Site, record
 from visitor import wait_for
 
 from studio.__main__ import main
@@ -24,22 +24,10 @@ from studio.thumbnails import telling_moment
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """With three takes of a second that have images."""
     data = tmp_path_factory.mktemp("dataset")
-    record(data, 3)
+    record(data, 1.0, 1.0, 1.0)
     site = Site(data)
-    site.studio.catalog.refresh()
     yield site
     site.close()
-
-
-@pytest.fixture
-def client(site: Site) -> Iterator[Client]:
-    with Client(site.front.url, author="ann") as client:
-        yield client
-
-
-@pytest.fixture
-def ids(site: Site) -> list[str]:
-    return [row.episode_id for row in site.studio.episodes()]
 
 
 def test_the_page_loads_nothing_from_elsewhere(site: Site) -> None:
@@ -65,7 +53,8 @@ def test_a_take_without_images_has_no_thumbnail(tmp_path: Path) -> None:
     path = record_forces(tmp_path, "blind")
     site = Site(tmp_path)
     try:
-        answer = httpx.get(f"{site.front.url}/api/v1/episodes/{path.stem}/thumbnail")
+        address = f"{site.front.url}/api/v1/episodes/{path.stem}/thumbnail"
+        answer = httpx.get(address, timeout=60.0)  # a process that reads is started first
         assert (answer.status_code, answer.json()["detail"]) == (404, "blind has no images.")
     finally:
         site.close()

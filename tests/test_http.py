@@ -16,71 +16,29 @@ import httpx
 import numpy as np
 import pytest
 import schemathesis
+from http_site import Site, record
 from hypothesis import HealthCheck, given, settings
 from visitor import wait_for
 
-from studio.api import Studio
-from studio.benchmarks.episodes import made_up_header, write_take
 from studio.client import Client, Refused
 from studio.door import Access, Door
 from studio.edits import edits_path, read
-from studio.http import add_api
 from studio.index import Filters
-from studio.lease import GRACE, Lease
+from studio.lease import GRACE
 from studio.link import socket_path
 from studio.messages import Drive, Reset, SetGripper, Shutdown, StartTake, builtins
-from studio.server import FrontServer, make_app
-from studio.ui.remote import Remote
 
-NOBODY = 9  # the discard port: the page of viser is not needed here
 TOKEN = "a-token-that-is-secret"
-
-
-class Site:
-    """A studio on a folder, its API behind a front server, and a lease; no session process."""
-
-    def __init__(self, data: Path, **options: object) -> None:
-        self.studio, self.remote = Studio(data), Remote()
-        self.lease = Lease(self.remote.post)
-        self.app = make_app(NOBODY)
-        self.reader = add_api(self.app, self.studio, self.remote, self.lease)
-        self.front = FrontServer(self.app, port=0, **options)  # type: ignore[arg-type]
-        self.front.start()
-
-    def close(self) -> None:
-        self.front.stop()
-        self.reader.close()
-        self.remote.close()
-        self.studio.close()
-
-
-def record(data: Path, n: int) -> None:
-    """Takes of a second, of two arms and three cameras."""
-    for _ in range(n):
-        header = made_up_header()
-        write_take(data / "episodes" / header.task / f"{header.episode_id}.mcap", header, 1.0)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """With three takes of a second; tests leave them as they were."""
     data = tmp_path_factory.mktemp("api")
-    record(data, 3)
+    record(data, 1.0, 1.0, 1.0)
     site = Site(data)
-    site.studio.catalog.refresh()
     yield site
     site.close()
-
-
-@pytest.fixture
-def client(site: Site) -> Iterator[Client]:
-    with Client(site.front.url, author="ann") as client:
-        yield client
-
-
-@pytest.fixture
-def ids(site: Site) -> list[str]:
-    return [row.episode_id for row in site.studio.episodes()]
 
 
 # Takes
@@ -375,7 +333,7 @@ def test_a_stream_tells_at_the_rate_that_was_asked_for(live: Site) -> None:
 @pytest.mark.parametrize("examples", [3, pytest.param(150, marks=pytest.mark.verify)])
 def test_nothing_that_the_description_allows_breaks_the_server(tmp_path: Path, examples: int) -> None:
     """Half of the requests are about a take, a camera and a collection that exist."""
-    record(tmp_path, 2)
+    record(tmp_path, 1.0, 1.0)
     site = Site(tmp_path)
     site.studio.jobs.slots = 0  # what is asked for waits
     rows = site.studio.episodes()

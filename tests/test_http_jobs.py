@@ -12,7 +12,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from test_http import Site
+from http_site import Site
 from test_training import QUICK
 
 from policy.config import PRESETS, TrainConfig
@@ -29,12 +29,6 @@ def site(tmp_path: Path, recorded: tuple[Path, DemoReport]) -> Iterator[Site]:
     site.studio.jobs.slots = 0
     yield site
     site.close()
-
-
-@pytest.fixture
-def client(site: Site) -> Iterator[Client]:
-    with Client(site.front.url, author="ann") as client:
-        yield client
 
 
 def changes() -> dict[str, object]:
@@ -149,6 +143,7 @@ def test_evaluations_are_compared_scene_by_scene(site: Site, client: Client) -> 
     low, high = paired.comparison.difference_95
     assert 0 < low < 0.5 < high <= 1
     assert [scene["other"]["success"] for scene in paired.scenes].count(False) == 4
+    assert {"demonstrator", "nothing"} <= set(client.jobs.references())
     with pytest.raises(Refused, match="No evaluation 'x'"):
         client.jobs.evaluation("x")
     address = f"{site.front.url}/api/v1/evaluations/e-a/figures/force"

@@ -6,44 +6,25 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import av
+import http_site
 import httpx
 import numpy as np
 import pytest
 
 from studio import curves
-from studio.api import Studio
-from studio.benchmarks.episodes import made_up_header, write_take
 from studio.client import Client, Refused
 from studio.cursor import Cursor
-from studio.http import add_api
-from studio.lease import Lease
-from studio.server import FrontServer, make_app
-from studio.ui.remote import Remote
-
-NOBODY = 9  # the discard port: the page of viser is not needed here
 
 
-class Site:
-    """A studio of two takes, of two arms and three cameras, behind a front server."""
+class Site(http_site.Site):
+    """With two takes, of two arms and three cameras."""
 
     def __init__(self, data: Path) -> None:
-        for seconds in (1.0, 1.5):
-            header = made_up_header()
-            write_take(data / "episodes" / header.task / f"{header.episode_id}.mcap", header, seconds)
-        self.studio, remote = Studio(data), Remote()
-        self.studio.catalog.refresh()
+        http_site.record(data, 1.0, 1.5)
+        super().__init__(data)
         self.short, self.long = (
             row.episode_id for row in self.studio.catalog.episodes(sort="duration", descending=False)
         )
-        app = make_app(NOBODY)
-        self.reader = add_api(app, self.studio, remote, Lease(remote.post))
-        self.front = FrontServer(app, port=0)
-        self.front.start()
-
-    def close(self) -> None:
-        self.front.stop()
-        self.reader.close()
-        self.studio.close()
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +32,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     site = Site(tmp_path_factory.mktemp("view"))
     yield site
     site.close()
-
-
-@pytest.fixture
-def client(site: Site) -> Iterator[Client]:
-    with Client(site.front.url) as client:
-        yield client
 
 
 def test_the_timeline_is_the_cursors(site: Site, client: Client) -> None:

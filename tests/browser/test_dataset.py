@@ -7,46 +7,32 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import http_site
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 from visitor import PATIENCE, wait_for
 
-from studio.api import Studio
 from studio.benchmarks.catalog import fill
 from studio.benchmarks.episodes import made_up_header, write_take
 from studio.edits import edits_path, read
-from studio.http import add_api
 from studio.index import EpisodeRow
-from studio.lease import Lease
-from studio.server import FrontServer, make_app
-from studio.ui.remote import Remote
 
 pytestmark = pytest.mark.browser
 
-NOBODY = 9  # the discard port: viser's page is not needed here
+EVIL = "<img src=x onerror=alert(1)>"
 TAKES = 6  # seeds 0 .. 5; the odd ones are bob's
 
 
-class Site:
+class Site(http_site.Site):
     """The page over a data folder, without a robot."""
 
-    def __init__(self, data: Path) -> None:
-        self.studio, self.remote = Studio(data), Remote()
-        app = make_app(NOBODY)
-        self.reader = add_api(app, self.studio, self.remote, Lease(self.remote.post))
-        self.front = FrontServer(app, port=0)
-        self.front.start()
-        self.url = f"{self.front.url}/dataset"
+    @property
+    def url(self) -> str:
+        return f"{self.front.url}/dataset"
 
     def take(self, seed: int) -> EpisodeRow:
         (row,) = self.studio.catalog.episodes(seed=seed)
         return row
-
-    def close(self) -> None:
-        self.front.stop()
-        self.reader.close()
-        self.remote.close()
-        self.studio.close()
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +43,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     for seed in range(TAKES):
         header = made_up_header(arms=("right",), cameras=("front",))
         operator = "bob" if seed % 2 else "ann"
-        header = dataclasses.replace(header, seed=seed, operator=operator, started=1.7e9 + 60 * seed)
+        header = dataclasses.replace(
+            header, seed=seed, operator=operator, agent=EVIL, started=1.7e9 + 60 * seed
+        )
         write_take(data / "episodes" / header.task / f"{header.episode_id}.mcap", header, 0.3)
     site = Site(data)
-    site.studio.catalog.refresh()
     yield site
     site.close()
 
@@ -127,6 +114,8 @@ def test_keys_annotate_and_take_back_but_not_while_typing(
 
 def test_filters_narrow_the_list_and_a_link_shows_the_same_again(page: Page, site: Site) -> None:
     visit(page, site)
+    expect(page.locator("#facets").get_by_role("button", name=EVIL)).to_be_visible()  # in words
+    expect(page.locator("img[src=x]")).to_have_count(0)
     page.locator("#facets").get_by_role("button", name="bob").click()
     expect(rows(page)).to_have_count(TAKES // 2)
     expect(page.locator(".amount")).to_contain_text("3 takes")
