@@ -215,17 +215,22 @@ class Comparison:
         )
 
 
-def compare(one: Evaluation, other: Evaluation) -> Comparison:
-    """Pair two evaluations by scene; raises ValueError where they share none."""
-    if (one.task, one.spread) != (other.task, other.spread):
+def check_same_scenes(run: str, task: str, spread: float, seeds: Iterable[int], other: Evaluation) -> None:
+    """Raise ValueError where an evaluation met none of the scenes of a run."""
+    if (task, spread) != (other.task, other.spread):
         raise ValueError(
-            f"{one.run} ran on {one.task} with spread {one.spread:g}, {other.run} on {other.task} with "
+            f"{run} ran on {task} with spread {spread:g}, {other.run} on {other.task} with "
             f"spread {other.spread:g}: these are other scenes."
         )
+    if not {rollout.seed for rollout in other.judged} & set(seeds):
+        raise ValueError(f"The evaluations of {run} and {other.run} have no seed in common.")
+
+
+def compare(one: Evaluation, other: Evaluation) -> Comparison:
+    """Pair two evaluations by scene; raises ValueError where they share none."""
+    check_same_scenes(one.run, one.task, one.spread, (r.seed for r in one.judged), other)
     others = {rollout.seed: rollout for rollout in other.judged}
     pairs = [(r, others[r.seed]) for r in one.judged if r.seed in others]
-    if not pairs:
-        raise ValueError(f"The evaluations of {one.run} and {other.run} have no seed in common.")
     only_one = sum(a.success and not b.success for a, b in pairs)
     only_other = sum(b.success and not a.success for a, b in pairs)
     return Comparison(

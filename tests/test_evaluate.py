@@ -18,6 +18,7 @@ from controller.model import ur5e
 from controller.types import Action, CartesianTarget, JointTarget, Observation
 from policy.agent import History, Inputs, Policy, load_policy
 from studio import references, tasks
+from studio.__main__ import main
 from studio.api import Studio
 from studio.evaluate import Plan
 from studio.evaluation import Evaluation, Rollout, compare, load, mcnemar, wilson
@@ -170,6 +171,19 @@ def test_only_the_same_scenes_are_compared(demonstrator: Evaluation) -> None:
     ):
         with pytest.raises(ValueError, match=r"other scenes|no seed in common"):
             compare(demonstrator, other)
+
+
+def test_a_comparison_that_cannot_be_is_refused_before_anything_runs(
+    data: Path, demonstrator: Evaluation, capfd: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("evaluate", "nothing", "--task", "wiping", "--compare", demonstrator.evaluation_id)
+    for others, why in ((("--seeds", "5"), "no seed in common"), (("--spread", "2"), "other scenes")):
+        with pytest.raises(SystemExit) as ended:
+            main([*asked, *others, "--data", str(data)])
+        assert ended.value.code == 2
+        assert why in capfd.readouterr().err
+    with Studio(data) as studio:
+        assert "nothing" not in {found.run for found in studio.evaluations()}
 
 
 def test_errors_are_not_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

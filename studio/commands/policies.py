@@ -187,10 +187,12 @@ def _roll_out(
 ) -> int:
     """Evaluate a plan, compare it with the evaluation named `other`, and print both."""
     from studio.api import Studio
-    from studio.evaluation import Rollout, compare
+    from studio.evaluation import Rollout, check_same_scenes, compare
 
     with Studio(data) as studio:
         found_before = studio.evaluation(other, plan.task) if other else None
+        if found_before:  # not only after an hour
+            check_same_scenes(plan.run, plan.task, plan.spread, plan.seeds, found_before)
         file = ProgressFile(progress_file, len(plan.seeds))
         with progress(f"{plan.run} on {plan.task}", len(plan.seeds), quiet=json) as advance, ends_orderly():
 
