@@ -154,6 +154,24 @@ def test_a_checkpoint_gives_the_same_actions_as_before(tmp_path: Path, dataset: 
     assert spec.cameras == {"front": (48, 48), "wrist": (48, 48)}
 
 
+def test_what_was_saved_says_what_the_network_said(tmp_path: Path, dataset: Dataset) -> None:
+    with machine("cpu", 1) as here:
+        learner = Learner.begin(TINY, dataset, tmp_path / "run", here, resume=False)
+        batch, _ = learner.batches.at(0)
+        learner.prepare()
+        learner.model.loss(batch)["loss"].backward()
+        learner.optimizer.step()
+        learner.average()
+        learner.step = 1
+        learner.save()
+    sample = np.array([7])
+    values = learner.averaged.eval()(learner.batches.of(sample)).detach().double().numpy()
+    said = learner.features.decode_action(values, dataset.seen(sample))
+    (arm,) = load_policy(tmp_path / "run").predict(inputs_of(dataset, 7)).arms
+    np.testing.assert_allclose(arm.position, said.base_from_target[0, :, 0, :3], atol=1e-6)
+    np.testing.assert_allclose(arm.translational, said.stiffness[0, :, 0, 0], rtol=1e-5)
+
+
 def test_last_and_best_point_to_checkpoints_and_others_go(tmp_path: Path, dataset: Dataset) -> None:
     train(TINY, dataset, tmp_path / "run")
     kept = {path.name for path in (tmp_path / "run" / "checkpoints").glob("[0-9]*")}
