@@ -17,8 +17,8 @@ from studio.twin import Twin
 
 
 def folder_of(run: str, data_dir: Path) -> Path:
-    """Of a run or checkpoint, by path or by the name of a run in `data_dir`."""
-    for folder in (Path(run), data_dir / "runs" / run):
+    """Of a run or checkpoint, by the name of a run in `data_dir` or by path."""
+    for folder in (data_dir / "runs" / run, Path(run)):
         if run and folder.is_dir():
             return folder
     there = sorted(folder.name for folder in (data_dir / "runs").glob("*/"))
