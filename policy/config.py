@@ -41,6 +41,7 @@ class TrainConfig:
     max_height: int = 96
     """[px] larger images are reduced."""
     max_width: int = 96
+    """[px] likewise."""
     past_end: Literal["repeat", "mask"] = "repeat"
     """What a chunk holds past the end of its take: the last action, or nothing that counts."""
 
@@ -81,7 +82,7 @@ class TrainConfig:
     """Of what reads the images; --lr if not given."""
     weight_decay: float = 1e-4
     warm_up: int = 200
-    """Steps of rising learning rate, before the cosine."""
+    """[steps] of rising learning rate, before the cosine."""
     clip: float = 5.0
     """Largest norm of the gradient."""
     ema: float = 0.999
@@ -94,7 +95,9 @@ class TrainConfig:
     validation: float = 0.1
     """Share of the takes that only validates."""
     validate_every: int = 500
+    """[steps] between two looks at the takes kept aside."""
     save_every: int = 500
+    """[steps] between two checkpoints, of which the last and the best stay."""
 
     # Machine
     device: str = "auto"
