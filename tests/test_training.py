@@ -205,6 +205,7 @@ def test_the_command_trains_and_goes_on(data: Path, capfd: pytest.CaptureFixture
         (("wiping", "--resume", "one"), "Give a task to begin a run, or --resume"),
         ((), "Give a task"),
         (("--resume", "one", "--steps", "3"), "leave out all others"),
+        (("--resume", "one", "--episodes", "1"), "leave out all others"),
         (("--resume", "two"), "No run 'two'; there are ['one']"),
         (("wiping", "--name", "one", *small), "There is a run one already"),
         (("wiping", "--name", "../x", *small), "cannot name a run"),

@@ -32,7 +32,9 @@ from studio.index import Filters
 from studio.jobs.progress import ProgressFile
 
 if TYPE_CHECKING:
+    from studio.api import Studio
     from studio.evaluate import Plan
+    from studio.training import Run
 
 
 def train(
@@ -62,14 +64,15 @@ def train(
         flags: All of these must be set.
         collection: Exactly these takes, as they were annotated when it was made; see `studio collection`.
     """
-    from studio import training
     from studio.api import Studio
 
     if bool(task) == bool(resume):
         raise ValueError("Give a task to begin a run, or --resume RUN to go on with one.")
-    if resume and config != PRESETS[config.preset]:
-        raise ValueError("A run goes on with the settings that it was begun with; leave out all others.")
-    quiet = json or not training.leads()
+    chosen = any(x is not None for x in (name, episodes, agent, operator, min_quality, collection)) or flags
+    if resume and (chosen or config != PRESETS[config.preset]):
+        raise ValueError(
+            "A run goes on with the settings and takes that it was begun with; leave out all others."
+        )
     with Studio(data) as studio:
         filters: Filters = {"agent": agent, "operator": operator, "min_quality": min_quality, "flags": flags}
         run = (
@@ -77,27 +80,36 @@ def train(
             if resume
             else studio.begin_run(task, config, name, episodes, filters, collection)
         )
-        if run.rollouts and not quiet:
-            told = f"{len(run.rollouts)} of {len(run.takes)} takes are no demonstrations: a policy drove."
-            errors.print(told, style="yellow")
-        total = run.config.steps - run.done
-        file = ProgressFile(progress_file if training.leads() else None, run.config.steps, run.done)
-        with progress(f"{run.folder.name}, {len(run.takes)} takes", total, quiet=quiet) as advance:
+        return _learn(studio, run, progress_file, json)
 
-            def tell(metrics: Mapping[str, float]) -> None:
-                advance()
-                file.tell(metrics["step"])
-                if "validation" in metrics and not quiet:
-                    errors.print(_training_line(metrics))
 
-            def read(name: str) -> None:
-                file.tell(run.done, f"reads {name}")
+def _learn(studio: Studio, run: Run, progress_file: Path | None, json: bool) -> int:
+    """Let a run learn, and tell how it goes. Of several processes only the leading one tells."""
+    from studio.training import leads
 
-            result = studio.train(run, on_take=read, on_step=tell)
-        file.end(plain(result))
-    if json and training.leads():
+    quiet = json or not leads()
+    if run.rollouts and not quiet:
+        told = f"{len(run.rollouts)} of {len(run.takes)} takes are no demonstrations: a policy drove."
+        errors.print(told, style="yellow")
+    total = run.config.steps - run.done
+    file = ProgressFile(progress_file if leads() else None, run.config.steps, run.done)
+    what = f"{run.folder.name}, {len(run.takes)} takes"
+    with progress(what, total, quiet=quiet) as advance, ends_orderly():  # while it reads takes, too
+
+        def tell(metrics: Mapping[str, float]) -> None:
+            advance()
+            file.tell(metrics["step"])
+            if "validation" in metrics and not quiet:
+                errors.print(_training_line(metrics))
+
+        def read(name: str) -> None:
+            file.tell(run.done, f"reads {name}")
+
+        result = studio.train(run, on_take=read, on_step=tell)
+    file.end(plain(result))
+    if json and leads():
         print_json(result)
-    elif training.leads():
+    elif leads():
         end = (
             "Finished" if result.is_finished else f"Stopped; studio train --resume {run.folder.name} goes on"
         )
