@@ -5,7 +5,7 @@ part lies in its hand differs at every reset, across the hand and by a tilt, and
 turn apart, so that together the parts miss each other in a direction and by an amount that nobody knows
 before they touch: the rim pushes back off centre, and the torque at the wrist says to which side.
 
-All numbers below were fixed before any policy was trained.
+The numbers of the difficulty and of success below were fixed before any policy was trained.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ RIGHT_JOINTS = np.array([-2.41, -1.73, -1.89, -2.66, -2.42, -3.14])
 START_GAP = 0.12  # [m] between the parts
 
 PUSHED = 0.031  # [m] depth of the target at the end
+ROUGH, NEAR = (0.02, math.radians(3.0)), (0.01, math.radians(1.5))  # most by which one aims beside the mouth
 FIT = PegInHole("hole", HOLE_FROM_PEG, "right", SEATED, PUSHED)
 
 
@@ -246,7 +247,9 @@ class Insertion:
     def demonstrate(self, world: World, rng: np.random.Generator) -> Iterator[Action]:
         """Bring the parts face to face, feel for the hole, correct, push until seated, hold.
 
-        What the hands hold, and how, is read from the world only after the rim has been felt.
+        As a person does, it aims roughly from afar and corrects before the parts meet, which shows what to do
+        when off (noise while demonstrating: Laskey et al. 2017, arXiv 1703.09327). What the hands hold, and
+        how, is read from the world only after the rim has been felt.
         """
         style = STYLES[rng.integers(len(STYLES))]
         speed = rng.uniform(0.85, 1.2)
@@ -254,13 +257,22 @@ class Insertion:
             Motion(world.tcp(arm.name), StiffnessMode.MEDIUM, 0.0, world.table, speed, arm.base_position)
             for arm in self.arms
         )
+        gap = style.gap * rng.uniform(0.85, 1.15)
+
+        def before(seen: Pose) -> Pose:
+            """world_from_tcp of the right hand, in line with where the mouth is believed to be."""
+            return FIT.target(seen, Pose.identity(), -gap)
+
         mouth = self._meeting @ misjudgement(rng, MISJUDGED, MISJUDGED_TURN, self.turn)
-        before = FIT.target(mouth, Pose.identity(), -style.gap * rng.uniform(0.85, 1.15))
-        detour = Pose(before.position + style.detour * rng.uniform(0.7, 1.3), before.wxyz)
+        rough = before(mouth @ misjudgement(rng, *ROUGH))
+        detour = Pose(rough.position + style.detour * rng.uniform(0.7, 1.3), rough.wxyz)
         seconds = style.approach * rng.uniform(0.9, 1.1)
         hands = (left, right)
         yield from together(hands, left.move(self._meeting, seconds), right.move(detour, seconds))
-        yield from together(hands, right.move(before, rng.uniform(1.0, 1.4)))
+        yield from together(
+            hands, right.move(before(mouth @ misjudgement(rng, *NEAR)), rng.uniform(0.8, 1.1))
+        )
+        yield from together(hands, right.move(before(mouth), rng.uniform(0.6, 0.9)))
         yield from together(hands, right.wait(style.pause * rng.uniform(0.8, 1.2)))
         left.mode, right.mode = StiffnessMode.HIGH, StiffnessMode.LOW
         how = Pushing(style.push, style.pause, self.wiggle)
