@@ -237,7 +237,8 @@ class Features:
 
     def encode_wrench(self, history: Array) -> Array:
         """(..., samples, arms * 6), normalised, of (..., samples, arms, 6) [N, N·m]."""
-        return self.wrench.normalise(history.reshape(*history.shape[:-2], -1))
+        joined = history.reshape(*history.shape[:-2], self.wrench.mean.size)  # of no samples, too
+        return self.wrench.normalise(joined)
 
     def encode_action(self, targets: Targets, seen: ArmStates) -> Array:
         """(..., steps, action_width), normalised, of targets (..., steps, arms)."""

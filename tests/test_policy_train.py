@@ -335,6 +335,17 @@ def observation(time: float, image_time: float) -> Observation:
     return Observation(time, (arm,), images)
 
 
+def test_a_policy_without_forces_drives_from_observations(tmp_path: Path, dataset: Dataset) -> None:
+    train(dataclasses.replace(TINY, wrench=False), dataset, tmp_path / "run")
+    policy = load_policy(tmp_path / "run")
+    history = History(policy.spec)
+    for tick in range(10):
+        history.add(now := observation(tick * 0.01, tick * 0.01))
+    inputs = history.inputs(now)
+    assert inputs.wrench.shape == (0, 1, 6)
+    assert policy.predict(inputs).arms[0].position.shape == (10, 3)
+
+
 def test_a_policy_drives_from_observations(tmp_path: Path, dataset: Dataset) -> None:
     train(TINY, dataset, tmp_path / "run")
     policy = load_policy(tmp_path / "run")
