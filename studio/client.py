@@ -37,7 +37,7 @@ from studio.messages import ArmFrame, Command, Notice, Status, builtins
 from studio.runs import RunInfo
 
 API = "/api/v1"
-TIMEOUT = 60.0  # [s] for the health of a long take, or its columns
+TIMEOUT = 300.0  # [s] on a busy machine, for the health of a long take, its columns, or the time of a run
 
 T = TypeVar("T")
 
