@@ -107,8 +107,12 @@ def table(evaluations: Sequence[Evaluation]) -> str:
 
 
 def pairs(evaluations: Sequence[Evaluation]) -> list[str]:
-    """A sentence for every two that met the same scenes, and for what hiding does to all runs together."""
-    met = [(*two, compare(*two)) for two in itertools.combinations(evaluations, 2) if _meet(*two)]
+    """A sentence for every two that met the same scenes, and for what hiding does to all runs together.
+
+    Whoever sees and feels all comes first, in whatever order they are given.
+    """
+    ordered = sorted(evaluations, key=lambda evaluation: bool(evaluation.provenance.get("hidden")))
+    met = [(*two, compare(*two)) for two in itertools.combinations(ordered, 2) if _meet(*two)]
     told = [str(comparison) for _, _, comparison in met]
     blinded: dict[tuple[str, ...], list[Comparison]] = {}
     for one, other, comparison in met:

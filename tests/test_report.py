@@ -86,6 +86,7 @@ def test_hiding_is_judged_over_all_runs(drawn: tuple[Path, list[Evaluation]]) ->
             told = {"run": run, "step": 9, "execution": "replan", "replan_every": 10, "hidden": hidden}
             evaluations.append(dataclasses.replace(drawn[1][0], run=run, provenance=told, rollouts=rollouts))
     sentences = report.pairs(evaluations)
+    assert sentences[-1] == report.pairs(evaluations[::-1])[-1]
     assert len(sentences) == 6 + 1
     assert sum("p = 0.12)" in sentence for sentence in sentences) >= 2
     assert sentences[-1].startswith("2 runs that see and feel all against the same with objects hidden on 8")
