@@ -36,6 +36,7 @@ from studio.references import REFERENCES
 from studio.session import CONTROL_PERIOD, Agent
 from studio.station import CONTACT, Station, Take
 from studio.tasks import HELD_SUCCESS
+from studio.training import EVALUATION
 from studio.twin import Twin
 
 _MakeAgent = Callable[[Twin], Agent]
@@ -302,7 +303,7 @@ def _roll_out(
         take = station.record(
             make_agent,
             agent_name=plan.run,
-            operator="evaluation",
+            operator=EVALUATION,
             seed=seed,
             spread=plan.spread,
             subscribers=[feel],
