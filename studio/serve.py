@@ -88,10 +88,15 @@ class SessionProcess:
                 self.pid = self.find()
                 return
             except TimeoutError:
-                if self._child is not None and self._child.poll() is not None:
+                if self.has_ended:
                     raise RuntimeError(f"The session process ended at once: {self._last_words()}") from None
                 if time.monotonic() > deadline:
                     raise
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the one that was started here has."""
+        return self._child is not None and self._child.poll() is not None
 
     def end(self) -> None:
         """Let it end by itself, and kill what is left; its cameras go with it."""
@@ -110,7 +115,7 @@ class SessionProcess:
         while time.monotonic() < deadline:
             if self._child is None and self.find() is None:
                 return True
-            if self._child is not None and self._child.poll() is not None:
+            if self.has_ended:
                 return True
             time.sleep(0.05)
         return False
@@ -172,6 +177,8 @@ def serve(
         _write(lock, site.front.url)
         site.page.start()
         stack.callback(_end_session, site.page.remote, process)
+        if process.has_ended:  # on a machine so busy that nobody came for a minute
+            process.start()
         process.connect(site.page.remote)
         tell(f"Comp-ACT Studio serves {data_dir} at {site.front.url}")
         if site.invitation:

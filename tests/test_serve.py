@@ -188,8 +188,14 @@ def test_a_session_that_does_not_answer_is_killed_at_the_end(site: Site) -> None
     assert not alive(pid)
 
 
-def test_a_session_that_cannot_start_says_why(site: Site) -> None:
-    process = SessionProcess(site.data, "no-such-task", cameras=False)
+def test_a_session_that_cannot_start_says_why_and_another_can(site: Site) -> None:
+    process, remote = SessionProcess(site.data, "no-such-task", cameras=False), Remote()
     process.start()
     with pytest.raises(RuntimeError, match="no-such-task"):
-        process.connect(Remote())
+        process.connect(remote)
+    assert process.has_ended
+    process.start("wiping")
+    process.connect(remote)
+    assert not process.has_ended
+    remote.close()
+    process.end()
