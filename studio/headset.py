@@ -155,8 +155,8 @@ class _Headset:
         self._pong: str | None = None  # to be sent back
 
     async def run(self) -> None:
-        await self._socket.accept()
         try:
+            await self._socket.accept()
             async with asyncio.TaskGroup() as group:
                 telling = group.create_task(self._tell())
                 await self._listen()

@@ -14,6 +14,7 @@ import logging
 import os
 import select
 import socket
+import stat
 import tempfile
 import threading
 import time
@@ -36,7 +37,8 @@ def socket_path(data_dir: Path) -> Path:
     """Where the session process of a data folder listens; the folder is the user's alone."""
     folder = Path(tempfile.gettempdir()) / f"compact-studio-{getpass.getuser()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    if folder.stat().st_mode & 0o077:
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.geteuid() or about.st_mode & 0o077:
         raise PermissionError(f"{folder} can be entered by others; remove it or set its mode to 700.")
     return folder / f"{hashlib.sha256(str(data_dir.absolute()).encode()).hexdigest()[:16]}.sock"
 
