@@ -258,8 +258,8 @@ def test_a_selection_becomes_a_collection_that_stays_as_it_is(
 
 
 def test_ten_thousand_takes_are_scrolled_by_a_few_rows(page: Page, tmp_path: Path) -> None:
-    made = fill(tmp_path, 10_000)
     site = Site(tmp_path)
+    made = fill(tmp_path, 10_000)
     page.route("**/api/v1/refresh", lambda route: route.fulfill(json={}))  # there are no files
     try:
         page.goto(site.url)
