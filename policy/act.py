@@ -76,7 +76,7 @@ class Act(nn.Module):
         self.n_cameras = n_cameras if config.images else 0
         self.has_wrench, self.has_cvae = config.wrench, config.cvae
         self.latent, self.kl_weight = config.latent, config.kl_weight
-        self.state_dropout = config.state_dropout
+        self.state_dropout, self.own_width = config.state_dropout, encoding.own_width
         self._groups: dict[Group, list[int]] = {name: encoding.columns(name) for name in encoding.groups}
         n_wrench = encoding.n_arms * 6
 
@@ -148,7 +148,9 @@ class Act(nn.Module):
     ) -> Tensor:
         state = batch.state
         if self.training and self.n_cameras:
-            state = state * (torch.rand(len(state), 1, device=state.device) >= self.state_dropout)
+            kept = torch.rand(len(state), 1, device=state.device) >= self.state_dropout
+            own = torch.arange(state.shape[1], device=state.device) < self.own_width
+            state = state * (kept | ~own)
         tokens = [self.state_token(state)[:, None]]
         if self.has_wrench:
             tokens.append(self.wrench_tokens(batch.wrench * (not hide_wrench)))

@@ -32,6 +32,8 @@ class TrainConfig:
     rotation: Literal["6d", "axis-angle"] = "6d"
     stiffness: Literal["log-diagonal", "cholesky", "mode"] = "log-diagonal"
     """Cholesky, the paper's 12 numbers, also learns blocks that are not diagonal."""
+    between: bool = True
+    """The state also tells how the second tool stands to the first, where there are two."""
     rate: float = 20.0
     """[Hz] of the steps of a chunk."""
     chunk_seconds: float = 2.0
@@ -59,7 +61,7 @@ class TrainConfig:
     pre_norm: bool = True
     dropout: float = 0.1
     state_dropout: float = 0.5
-    """Share of the samples that are learned without the arm's state, so that images, if any, have to tell."""
+    """Share of the samples that are learned without where each arm is: images, if any, have to tell."""
     cvae: bool = False
     """Learn a latent for what the observation does not tell; zero when the policy runs."""
     cvae_layers: int = 2
@@ -162,6 +164,7 @@ PRESETS: dict[Preset, TrainConfig] = {
         preset="paper",
         frame="absolute",
         rotation="axis-angle",
+        between=False,
         stiffness="cholesky",
         rate=40.0,
         chunk_seconds=2.5,

@@ -169,7 +169,9 @@ def fit(dataset: Dataset, config: TrainConfig, training: Array) -> Features:
         for poses in np.moveaxis(seen.base_from_tcp, 1, 0)
     )
     control: Control = "joint" if config.policy == "act" else "cartesian"
-    encoding = Encoding(len(dataset.arms), control, config.frame, config.rotation, config.stiffness, branch)
+    n_arms = len(dataset.arms)
+    between = config.between and n_arms == 2 and control == "cartesian"
+    encoding = Encoding(n_arms, control, config.frame, config.rotation, config.stiffness, branch, between)
     dataset.check(encoding)
     targets, valid = dataset.targets(chosen, config.chunk, config.rate)
     actions = encoding.action(targets, seen)

@@ -78,6 +78,7 @@ class Encoding:
     stiffness: Literal["log-diagonal", "cholesky", "mode"] = "log-diagonal"
     # (arms, 3) rotation vector of each arm's mean orientation: where absolute axis-angle has its branch.
     branch: tuple[tuple[float, float, float], ...] = ()
+    between: bool = False  # the state also tells how the last of two tools stands to the first
 
     @property
     def groups(self) -> dict[Group, int]:
@@ -99,6 +100,11 @@ class Encoding:
 
     @property
     def state_width(self) -> int:
+        return self.own_width + (9 if self.between else 0)
+
+    @property
+    def own_width(self) -> int:
+        """Numbers of the state that tell where each arm is by itself; they come first."""
         rotation = 6 if self.rotation == "6d" else 3
         return self.n_arms * (7 if self.control == "joint" else 4 + rotation)
 
@@ -119,7 +125,8 @@ class Encoding:
         else:
             turn = self._rotation_numbers(rotations.matrices(arms.base_from_tcp[..., 3:]), absolute=True)
             parts = [arms.base_from_tcp[..., :3], turn, arms.gripper[..., None]]
-        return _joined(parts)
+        own = _joined(parts)
+        return np.concatenate((own, _between(arms)), axis=-1) if self.between else own
 
     def action(self, targets: Targets, seen: ArmStates) -> Array:
         """(..., steps, action_width) of targets (..., steps, arms), seen from arm states (..., arms)."""
@@ -276,6 +283,16 @@ def _joined(parts: Sequence[Array]) -> Array:
     """(..., arms * width) of parts (..., arms, w)."""
     joined = np.concatenate(parts, axis=-1)
     return joined.reshape(*joined.shape[:-2], -1)
+
+
+def _between(arms: ArmStates) -> Array:
+    """(..., 9): from the first tool to the last, position [m] and rotation in the axes of their bases.
+
+    These are parallel, and a constant way between them is of no consequence once normalised.
+    """
+    first, last = arms.base_from_tcp[..., 0, :], arms.base_from_tcp[..., -1, :]
+    turn = rotations.matrices(last[..., 3:]) @ np.swapaxes(rotations.matrices(first[..., 3:]), -1, -2)
+    return np.concatenate((last[..., :3] - first[..., :3], rotations.six_numbers(turn)), axis=-1)
 
 
 def _seen_rotation(seen: ArmStates) -> Array:

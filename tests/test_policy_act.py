@@ -23,7 +23,8 @@ B, SIZE = 3, 32
 def built(config: TrainConfig, n_arms: int = 1, n_cameras: int = 2) -> tuple[Act, Encoding]:
     torch.manual_seed(0)
     control = "joint" if config.policy == "act" else "cartesian"
-    encoding = Encoding(n_arms, control, config.frame, config.rotation, config.stiffness)
+    between = config.between and n_arms == 2 and control == "cartesian"
+    encoding = Encoding(n_arms, control, config.frame, config.rotation, config.stiffness, between=between)
     return Act.of(config, encoding, {f"c{n}": (SIZE, SIZE) for n in range(n_cameras)}), encoding
 
 
@@ -237,3 +238,17 @@ def test_a_share_of_the_samples_is_learned_without_the_state() -> None:
     assert same(model.eval()) == 0
     blind, _ = built(dataclasses.replace(TINY, state_dropout=0.5, images=False))
     assert same(blind) == 0  # the state is all it has
+
+
+def test_no_sample_is_learned_without_how_the_tools_stand_to_each_other() -> None:
+    model, encoding = built(dataclasses.replace(TINY, state_dropout=0.9), n_arms=2, n_cameras=1)
+    torch.manual_seed(1)
+    n = 16
+    states = torch.randn(2, n, encoding.state_width)
+    states[1, :, : encoding.own_width] = states[0, :, : encoding.own_width]
+    wrench, images = torch.zeros(n, TINY.wrench_history, 12), torch.zeros(n, 1, 16, 16, 3, dtype=torch.uint8)
+    told = []
+    for state in states:
+        torch.manual_seed(2)
+        told.append(model(Batch(state, wrench, images)))
+    assert not torch.isclose(*told, atol=1e-6).all((1, 2)).any()

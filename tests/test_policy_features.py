@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -70,6 +71,24 @@ def test_decoding_inverts_encoding(n_arms: int, frame: str, rotation: str, stiff
     )
     np.testing.assert_allclose(decoded.stiffness, targets.stiffness, rtol=1e-9)
     np.testing.assert_allclose(decoded.gripper, targets.gripper, atol=1e-12)
+
+
+def test_how_two_tools_stand_to_each_other_does_not_depend_on_where_they_are() -> None:
+    rng = np.random.default_rng(0)
+    seen, _ = seen_and_targets(2, rng)
+    plain, encoding = Encoding(2), Encoding(2, between=True)
+    states = encoding.state(seen)
+    np.testing.assert_array_equal(states[..., : encoding.own_width], plain.state(seen))
+    assert states.shape[-1] == encoding.state_width == plain.state_width + 9
+    moved = dataclasses.replace(seen, base_from_tcp=seen.base_from_tcp.copy())
+    moved.base_from_tcp[..., :3] += [0.1, -0.2, 0.05]
+    again = encoding.state(moved)
+    np.testing.assert_allclose(again[..., -9:], states[..., -9:], atol=1e-12)
+    # The last tool is where the first one is, and the way and the turn that are told.
+    position = seen.base_from_tcp[..., 0, :3] + states[..., -9:-6]
+    turn = from_six_numbers(states[..., -6:]) @ matrices(seen.base_from_tcp[..., 0, 3:])
+    np.testing.assert_allclose(position, seen.base_from_tcp[..., 1, :3], atol=1e-12)
+    np.testing.assert_allclose(turn, matrices(seen.base_from_tcp[..., 1, 3:]), atol=1e-9)
 
 
 @pytest.mark.parametrize("frame", ["relative", "absolute"])
