@@ -133,6 +133,9 @@ def test_from_demonstrations_to_a_policy_that_drives(site: Site, page: Page) -> 
     expect(link).to_have_attribute("href", f"/dataset?episode={rollout.episode_id}")
     expect(closer.locator("img.figure").first).to_have_js_property("complete", True)
     look(page, "evaluate")
+    link.click()
+    expect(page.locator("#episode")).to_have_attribute("data-drawn", rollout.episode_id, timeout=LONG)
+    look(page, "rollout")
     _drive_with(site, page, "learner")
 
 
