@@ -410,6 +410,7 @@ document.body.classList.toggle("embedded", start.isEmbedded);
 document.getElementById("top").append(
   h("b", {}, "Comp-ACT Studio"),
   h("nav", {}, h("a", { href: "/", target: "_top" }, "Drive"), h("a", { href: "/dataset", class: "here" }, "Dataset"),
+    h("a", { href: "/train?view=demo" }, "Demonstrate"),
     h("a", { href: "/train?view=train" }, "Train"), h("a", { href: "/train?view=evaluate" }, "Evaluate")),
 );
 attempt(async () => {
