@@ -1,8 +1,8 @@
 // Scripted demonstrations: of which task, and of which scenes.
 
 import { api } from "../dataset/api.js";
-import { attempt, h, toast } from "../dataset/dom.js";
-import { author, field, numberOf, select, setOptions } from "./fields.js";
+import { h, toast } from "../dataset/dom.js";
+import { author, field, form, numberOf, select, setOptions } from "./fields.js";
 import { Place } from "./place.js";
 
 export class DemoForm {
@@ -17,7 +17,7 @@ export class DemoForm {
     this.place = new Place();
     this.instruction = h("p", { class: "count" });
     this.button = h("button", { class: "main", type: "submit" }, "Start recording");
-    this.element = h("form", { onsubmit: (event) => { event.preventDefault(); attempt(() => this.start()); } },
+    this.element = form(this.button, () => this.start(),
       h("h2", {}, "Task"), field("Task", this.task), this.instruction,
       h("h2", {}, "Scenes"),
       h("div", { class: "pairs" }, field("First seed", this.seed), field("How many", this.episodes)),
@@ -53,12 +53,7 @@ export class DemoForm {
       seed: numberOf("First seed", this.seed.value), episodes: numberOf("How many", this.episodes.value),
       workers: numberOf("Workers", this.workers.value), spread: numberOf("Spread", this.spread.value), cameras: this.cameras.checked,
     };
-    this.button.disabled = true;
-    try {
-      this.started(await api.post("/jobs", body));
-    } finally {
-      this.button.disabled = false;
-    }
+    this.started(await api.post("/jobs", body));
   }
 
   fill(job) {

@@ -1,8 +1,8 @@
 // What to roll out: which checkpoint or reference, on which scenes.
 
 import { api } from "../dataset/api.js";
-import { attempt, h, toast } from "../dataset/dom.js";
-import { author, field, numberOf, select, setOptions } from "./fields.js";
+import { h, toast } from "../dataset/dom.js";
+import { author, field, form, numberOf, select, setOptions } from "./fields.js";
 import { Place } from "./place.js";
 
 export class EvaluateForm {
@@ -29,7 +29,7 @@ export class EvaluateForm {
     this.taskField = field("Task", this.task);
     this.whichField = field("Checkpoint", this.which);
     this.button = h("button", { class: "main", type: "submit" }, "Start evaluation");
-    this.element = h("form", { onsubmit: (event) => { event.preventDefault(); attempt(() => this.start()); } },
+    this.element = form(this.button, () => this.start(),
       h("h2", {}, "Agent"), field("Run or reference", this.agent), this.whichField, this.taskField,
       h("h2", {}, "Scenes"),
       h("div", { class: "pairs" }, field("First seed", this.seed), field("How many", this.episodes)),
@@ -80,12 +80,7 @@ export class EvaluateForm {
     } else {
       body.task = this.task.value;
     }
-    this.button.disabled = true;
-    try {
-      this.started(await api.post("/jobs", body));
-    } finally {
-      this.button.disabled = false;
-    }
+    this.started(await api.post("/jobs", body));
   }
 
   fill(job) {

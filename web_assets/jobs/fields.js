@@ -1,6 +1,6 @@
 // Parts of the forms: a labelled field, a choice, and a form made of a JSON schema.
 
-import { h } from "../dataset/dom.js";
+import { attempt, h } from "../dataset/dom.js";
 
 let numbers = 0;
 
@@ -11,6 +11,19 @@ export function field(label, control, help = "", flag = "") {
   if (text) control.setAttribute("aria-describedby", text.id);
   const name = h("span", { class: "name" }, h("label", { for: control.id }, label), flag && h("code", { title: "On the command line" }, flag));
   return h("div", { class: control.type === "checkbox" ? "field check" : "field" }, name, control, text);
+}
+
+// `submit` rests while `start` is under way; why it was refused is told.
+export function form(submit, start, ...children) {
+  const resting = async () => {
+    submit.disabled = true;
+    try {
+      await start();
+    } finally {
+      submit.disabled = false;
+    }
+  };
+  return h("form", { onsubmit: (event) => { event.preventDefault(); attempt(resting); } }, ...children);
 }
 
 // options: [[value, text], …]

@@ -2,7 +2,7 @@
 
 import { api } from "../dataset/api.js";
 import { attempt, h, toast } from "../dataset/dom.js";
-import { author, duration, field, fieldOf, numberOf, select, setOptions } from "./fields.js";
+import { author, duration, field, fieldOf, form, numberOf, select, setOptions } from "./fields.js";
 import { Place } from "./place.js";
 import { Sweep } from "./sweep.js";
 
@@ -31,7 +31,7 @@ export class TrainForm {
     this.byCollection = h("div", { hidden: true }, field("Collection", this.collection));
     this.settings = h("div", {});
     this.button = h("button", { class: "main", type: "submit" }, "Start training");
-    this.element = h("form", { onsubmit: (event) => { event.preventDefault(); attempt(() => this.start()); } },
+    this.element = form(this.button, () => this.start(),
       h("h2", {}, "Takes"), field("Task", this.task), field("From", this.source), this.byCollection, this.byFilter, this.count,
       h("h2", {}, "Policy"), this.settings,
       h("h2", {}, "Run"), field("Name", this.name), this.sweep.element, this.place.element,
@@ -170,20 +170,15 @@ export class TrainForm {
   }
 
   async start() {
-    this.button.disabled = true;
-    try {
-      const job = this.body(), fields = this.sweep.read();
-      if (fields) {
-        const found = await api.post("/sweeps", { job, fields });
-        toast(`${found.length} ${found.length === 1 ? "run is" : "runs are"} queued.`);
-        this.started(found[0]);
-      } else {
-        this.started(await api.post("/jobs", job));
-      }
-      this.name.value = "";
-    } finally {
-      this.button.disabled = false;
+    const job = this.body(), fields = this.sweep.read();
+    if (fields) {
+      const found = await api.post("/sweeps", { job, fields });
+      toast(`${found.length} ${found.length === 1 ? "run is" : "runs are"} queued.`);
+      this.started(found[0]);
+    } else {
+      this.started(await api.post("/jobs", job));
     }
+    this.name.value = "";
   }
 
   async estimate() {
