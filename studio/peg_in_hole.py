@@ -79,7 +79,10 @@ class PegInHole:
         how: Pushing,
         rng: np.random.Generator,
     ) -> Iterator[ArmAction]:
-        """Feel for the hole, draw back and correct where the rim is in the way, then push until seated.
+        """Feel for the hole, draw back and aside where the rim is in the way, then push until seated.
+
+        It goes aside while it draws back, when the touch is fresh: who learns from it remembers forces for
+        a moment only.
 
         `mouth` (world_from_hole) and `peg_from_tcp` are what one thinks at first. What they are is read from
         the world only after the rim has been felt.
@@ -101,8 +104,6 @@ class PegInHole:
             yield from hand.wait(0.5)
             if self.depth(world) > ENTERED:
                 break
-            yield from to(-RETREAT, 0.7)
-            yield from pause()
             mouth, peg_from_tcp = self._read(world, rng)
             yield from to(-RETREAT, rng.uniform(0.6, 0.9))
             yield from pause()
@@ -116,9 +117,8 @@ class PegInHole:
 
     def _read(self, world: World, rng: np.random.Generator) -> tuple[Pose, Pose]:
         """World_from_hole and peg_from_tcp, as well as feeling the rim tells them."""
-        return world.pose(self.hole) @ misjudgement(rng, READING_ERROR, READING_TURN), self.peg_from_tcp(
-            world
-        )
+        error = misjudgement(rng, READING_ERROR, READING_TURN)
+        return world.pose(self.hole) @ error, self.peg_from_tcp(world)
 
 
 def misjudgement(rng: np.random.Generator, shift: float, tilt: float, turn: float = 0.0) -> Pose:
