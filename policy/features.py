@@ -21,7 +21,7 @@ Control = Literal["cartesian", "joint"]
 Group = Literal["position", "rotation", "joints", "gripper", "stiffness"]
 
 FLOOR = 0.01  # smallest standard deviation, so that a number that never changes does not become noise
-WRENCH_FLOOR = (1.0, 1.0, 1.0, 0.05, 0.05, 0.05)  # [N] and [N·m]: below is noise of the sensor
+WRENCH_FLOOR = (0.1, 0.1, 0.1, 0.005, 0.005, 0.005)  # [N] and [N·m]: noise of a good sensor
 INSIDE = 1e-9  # relative: decoded stiffness keeps this far inside the bounds, so that none is cut back
 MODES = tuple(StiffnessMode)
 
