@@ -45,6 +45,11 @@ class PolicySpec:
     step: int  # of the training
     stiffness_table: StiffnessTable = "tuned"  # what the controller must be set up for
 
+    def check_replan(self, every: int | None) -> None:
+        """Raise ValueError where chunks have fewer steps than shall be played of each."""
+        if every is not None and every > self.chunk:
+            raise ValueError(f"{self.run} tells {self.chunk} steps; it cannot be asked less often.")
+
     def check(
         self, task: str, arms: Iterable[str], cameras: Iterable[str], table: StiffnessTable | None = None
     ) -> None:

@@ -30,7 +30,7 @@ from studio.inputs.scripted import ScriptedAgent
 from studio.jobs import plans
 from studio.jobs.plans import Request
 from studio.jobs.queue import JobNow, Jobs
-from studio.pilot import runs_of
+from studio.pilot import Tried, runs_of, ways_to_play
 from studio.recovery import Recovery, recover_all
 from studio.session import Agent
 from studio.station import Station, Take
@@ -191,6 +191,10 @@ class Studio:
     def runs_of(self, task: str) -> list[str]:
         """Names of the runs that have learned a task, the newest first."""
         return runs_of(task, self.data_dir)
+
+    def ways_to_play(self, run: str) -> list[Tried]:
+        """How a run's chunks may be played live, what did best in evaluations first."""
+        return ways_to_play(run, self.data_dir)
 
     def evaluation(self, name: str, task: str | None = None) -> Evaluation:
         """By path, by id, or the newest of an agent."""

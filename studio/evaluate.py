@@ -80,8 +80,7 @@ class Plan:
         arms, cameras = [arm.name for arm in task.arms], [view.name for view in task.cameras]
         self.spec.check(self.task, arms, cameras, self.stiffness_table)
         ChunkExecutor(self.execution, self.replan_every, n_arms=len(task.arms))  # refuses what it cannot do
-        if self.replan_every is not None and self.replan_every > self.spec.chunk:
-            raise ValueError(f"{self.run} tells {self.spec.chunk} steps; it cannot be asked less often.")
+        self.spec.check_replan(self.replan_every)
         if is_address(self.agent) and {"images", "wrench"} & set(self.hide):
             raise ValueError("Hide images or wrenches where the policy runs: studio policy-server … --hide.")
 

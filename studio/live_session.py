@@ -19,7 +19,7 @@ from studio.episode import Header
 from studio.inputs.operator import HandOfOperator, OperatorAgent, step_of
 from studio.inputs.scripted import ScriptedAgent
 from studio.link import Hub
-from studio.pilot import Pilot
+from studio.pilot import Pilot, Playing
 from studio.recorder import Recorder
 from studio.reporter import Reporter
 from studio.session import CONTROL_PERIOD, Agent, Clock, Session
@@ -168,7 +168,8 @@ class LiveSession:
             case m.OperatorLeft():
                 self._let_hold()
             case m.Drive():
-                self._set_driver(command.driver, command.operator, command.policy)
+                playing = Playing(command.execution, command.replan_every)
+                self._set_driver(command.driver, command.operator, command.policy, playing)
             case m.Reset():
                 self._reset(command)
             case m.StartTake():
@@ -236,10 +237,12 @@ class LiveSession:
         if self._driver == "policy":
             self._set_driver("operator", self._operator)
 
-    def _set_driver(self, driver: m.Driver, operator: str, policy: str = "") -> None:
+    def _set_driver(
+        self, driver: m.Driver, operator: str, policy: str = "", playing: Playing | None = None
+    ) -> None:
         agent: Agent = self._hands
         if driver == "policy":
-            agent = self._pilot.agent(policy or self._pilot.run, self._robot)
+            agent = self._pilot.agent(self._robot, policy, playing)
         elif driver == "script":
             agent = ScriptedAgent(self._robot, self._robot.seed)
         self._driver, self._operator = driver, operator

@@ -54,7 +54,11 @@ class Drive(Message, frozen=True, kw_only=True):
 
     driver: Driver
     operator: Name = ""  # the person's name
-    policy: Name = ""  # name of the run that drives; empty for the one that did last
+    policy: Name = ""  # name of the run that drives; empty for the one that did last, as it did
+    execution: Literal["replan", "ensemble"] = (
+        "replan"  # how it plays chunks, see `policy.agent.ChunkExecutor`
+    )
+    replan_every: Annotated[int, Meta(ge=1, le=10_000)] | None = None
 
 
 class Engage(Message, frozen=True, kw_only=True):

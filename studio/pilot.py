@@ -6,11 +6,13 @@ who takes over can hand back at once.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from policy.agent import PolicySpec, read_spec
+from policy.agent import ChunkExecutor, ExecutionMode, PolicySpec, read_spec
+from studio import evaluation
 from studio.inputs.policy import PolicyAgent, Thinking
 from studio.policy_link import start
 from studio.twin import Twin
@@ -31,6 +33,51 @@ def runs_of(task: str, data_dir: Path) -> list[str]:
     return [folder.name for folder in folders if (spec := _spec_of(folder)) and spec.task == task]
 
 
+@dataclass(frozen=True, slots=True)
+class Playing:
+    """How a policy's chunks are played, see `ChunkExecutor`."""
+
+    execution: ExecutionMode = "replan"
+    replan_every: int | None = None
+
+    @property
+    def steps(self) -> int:
+        """Of a chunk, until the next is asked for."""
+        return ChunkExecutor(self.execution, self.replan_every, n_arms=1).replan_every
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A way of playing chunks, and how often the policy succeeded with it in evaluations."""
+
+    playing: Playing
+    successes: int = 0
+    trials: int = 0
+
+
+def ways_to_play(run: str, data_dir: Path) -> list[Tried]:
+    """What a run was evaluated with, the best by Wilson's lower bound first; then what is usual.
+
+    Evaluations that hid something, or that took place in wider or narrower scenes, do not count.
+    """
+    spec = read_spec(folder_of(run, data_dir))
+    usual = (
+        Playing("replan", 10),
+        Playing("replan", 20),
+        Playing("replan", spec.chunk),
+        Playing("ensemble", 1),
+    )
+    tally = {way: (0, 0) for way in usual if way.steps <= spec.chunk}
+    for done in evaluation.load_all(data_dir):
+        told = done.provenance
+        if done.run == run and done.spread == 1 and "replan_every" in told and not told.get("hidden"):
+            way = Playing(told["execution"], told["replan_every"])
+            successes, trials = tally.get(way, (0, 0))
+            tally[way] = successes + done.successes, trials + len(done.judged)
+    found = [Tried(way, *counts) for way, counts in tally.items()]
+    return sorted(found, key=lambda tried: -evaluation.wilson(tried.successes, tried.trials)[0])
+
+
 class Pilot:
     """Belongs to the session's thread, which it never keeps waiting."""
 
@@ -38,6 +85,7 @@ class Pilot:
         self._data_dir = data_dir
         self._mind: Thinking | None = None
         self._agent: PolicyAgent | None = None
+        self._playing = Playing()
 
     @property
     def run(self) -> str:
@@ -62,16 +110,22 @@ class Pilot:
         spec = self._mind.spec
         return {"run": spec.run, "step": spec.step, **self._agent.execution}
 
-    def agent(self, run: str, twin: Twin) -> PolicyAgent:
-        """What lets a run's newest policy drive `twin`. Raises KeyError or ValueError with why it cannot."""
-        folder, task = folder_of(run, self._data_dir), twin.task
+    def agent(self, twin: Twin, run: str = "", playing: Playing | None = None) -> PolicyAgent:
+        """What lets a run's newest policy drive `twin`, or without `run` the one that did last, as it did.
+
+        Raises KeyError or ValueError with why it cannot.
+        """
+        playing = playing if run and playing else self._playing
+        folder, task = folder_of(run or self.run, self._data_dir), twin.task
         spec = read_spec(folder)
         arms, cameras = [arm.name for arm in task.arms], [view.name for view in task.cameras]
         spec.check(task.name, arms, cameras, twin.config.stiffness_table)
+        spec.check_replan(playing.replan_every)
         if self._mind is None or self._mind.spec != spec or self._mind.error:
             self.close()
             self._mind = Thinking(spec, partial(start, folder))
-        self._agent = PolicyAgent(self._mind, grippers=twin.grippers)
+        self._playing = playing
+        self._agent = PolicyAgent(self._mind, playing.execution, playing.replan_every, grippers=twin.grippers)
         return self._agent
 
     def close(self) -> None:

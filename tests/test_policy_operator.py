@@ -26,7 +26,9 @@ from studio import messages as m
 from studio import tasks
 from studio.api import Studio
 from studio.episode import open_episode
+from studio.evaluation import Evaluation, Rollout
 from studio.inputs.policy import Immediate, PolicyAgent, Thinking
+from studio.pilot import Playing
 from studio.policy_link import PolicyServer, RemotePolicy, connect_to
 from studio.session import Session
 from studio.twin import Twin
@@ -303,7 +305,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 def test_a_person_takes_over_and_hands_back(stage: Stage) -> None:
     with Studio(stage.data) as studio:
         assert studio.runs_of("wiping") == ["blank"]
-    stage.link.send(m.Drive(driver="policy", operator="ana", policy="blank"))
+    stage.link.send(m.Drive(driver="policy", operator="ana", policy="blank", replan_every=20))
     stage.wait(lambda: stage.status.driver == "policy" and stage.status.policy == "blank")
     start = stage.arm.base_from_target
     # It wants the very pose that it sees; that its target has moved at all says that it was asked.
@@ -331,17 +333,42 @@ def test_a_person_takes_over_and_hands_back(stage: Stage) -> None:
             "run": "blank",
             "step": 7,
             "execution": "replan",
-            "replan_every": 10,
+            "replan_every": 20,
         }
 
 
-def test_a_policy_of_another_task_or_none_is_refused(stage: Stage) -> None:
-    for run, words in (("other", "learned 'drawing'"), ("nowhere", "No run 'nowhere'; there are")):
+def test_a_policy_that_cannot_drive_so_is_refused(stage: Stage) -> None:
+    for run, steps, words in (
+        ("other", None, "learned 'drawing'"),
+        ("nowhere", None, "No run 'nowhere'; there are"),
+        ("blank", 10_000, "it cannot be asked less often"),
+    ):
         stage.notices.clear()
-        stage.link.send(m.Drive(driver="policy", policy=run))
+        stage.link.send(m.Drive(driver="policy", policy=run, replan_every=steps))
         stage.wait(lambda: stage.heard("error"))
         assert words in stage.notices[-1].text
         assert stage.status.driver == "nobody"
+
+
+def test_what_did_best_when_evaluated_comes_first(tmp_path: Path) -> None:
+    blank.untrained(tmp_path / "runs" / "blank", "wiping")
+
+    def evaluated(name: str, every: int, successes: int, hidden: tuple[str, ...] = ()) -> None:
+        provenance = {"execution": "replan", "replan_every": every, "hidden": hidden}
+        rollouts = tuple(Rollout(seed, seed < successes) for seed in range(10))
+        Evaluation(name, 0.0, "blank", "wiping", 1.0, provenance, {}, rollouts, {}).save(tmp_path)
+
+    with Studio(tmp_path) as studio:
+        ways = studio.ways_to_play("blank")
+        assert ways[0].playing == Playing("replan", 10), "the usual one, as nothing is known"
+        evaluated("a", 10, 2)
+        evaluated("b", 5, 7)
+        evaluated("c", 5, 6)
+        evaluated("d", 20, 9, hidden=("wrench",))
+        best, second, *rest = studio.ways_to_play("blank")
+    assert (best.playing, best.successes, best.trials) == (Playing("replan", 5), 13, 20)
+    assert (second.playing, second.successes) == (Playing("replan", 10), 2)
+    assert all(not way.trials for way in rest)
 
 
 def test_the_arms_hold_when_a_policy_dies(stage: Stage) -> None:

@@ -23,6 +23,7 @@ from studio import tasks
 from studio.api import Studio
 from studio.lease import Standing
 from studio.link import Hub, socket_path
+from studio.pilot import Playing, Tried
 from studio.server import FrontServer, make_app, start_viser
 from studio.tasks import ArmSetup
 from studio.ui import control, viser_private
@@ -506,7 +507,14 @@ def test_runs_of_the_task_are_offered_and_one_is_asked_to_drive(gui: viser.Viser
     remote, asked = Remote(), []
     remote.post = asked.append  # type: ignore[method-assign, assignment]
     runs = {"wiping": ["wipe-2", "wipe-1"], "drawing": []}
-    desk = Desk(remote, lambda _: None, lambda _: None, runs_of=runs.__getitem__)
+    ways = [Tried(Playing("replan", 40), 9, 10), Tried(Playing("replan", 10))]
+    desk = Desk(
+        remote,
+        lambda _: None,
+        lambda _: None,
+        runs_of=runs.__getitem__,
+        ways_to_play=lambda run: ways if run == "wipe-1" else ways[1:],
+    )
     tab = TeleopTab(gui.gui, desk, Keypad(desk, lambda _: None))
     with Visitor(gui.get_port()) as ana:
         assert ana._find("GuiButtonMessage", "Policy") is None
@@ -516,7 +524,13 @@ def test_runs_of_the_task_are_offered_and_one_is_asked_to_drive(gui: viser.Viser
         wait_for(lambda: desk.policy == "wipe-1")
         ana.click("Policy")
         wait_for(lambda: asked)
-        assert asked == [m.Drive(driver="policy", operator="", policy="wipe-1")]
+        assert asked == [m.Drive(driver="policy", operator="", policy="wipe-1", replan_every=40)]
+        way = wait_for(lambda: ana._find("GuiDropdownMessage", "Plays"))
+        assert way["options"] == ["40 steps of each chunk (9/10)", "10 steps of each chunk"]
+        ana.send(
+            {"type": "GuiUpdateMessage", "uuid": way["uuid"], "updates": {"value": "10 steps of each chunk"}}
+        )
+        wait_for(lambda: desk.playing == Playing("replan", 10))
         tab.show(msgspec.structs.replace(STATUS, task="wiping", driver="policy", policy="wipe-1"))
         ana.button("● Policy")
         assert desk.policy == "wipe-1"

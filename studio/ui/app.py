@@ -83,6 +83,7 @@ class Page:
             studio.restore,
             operator=lambda: gate.lease.holder_name,
             runs_of=studio.runs_of,
+            ways_to_play=studio.ways_to_play,
         )
         self._invitation = invitation
         self.model = cache(scene.SceneModel)

@@ -29,6 +29,7 @@ from studio.messages import (
     TakeStatus,
     TakeTrashed,
 )
+from studio.pilot import Playing, Tried
 from studio.ui.remote import Remote
 
 Choice = Literal["gizmo", "keyboard", "script", "policy", "nobody"]
@@ -47,15 +48,17 @@ class Desk:
         operator: Callable[[], str] = str,
         now: Callable[[], float] = time.monotonic,
         runs_of: Callable[[str], list[str]] = lambda task: [],
+        ways_to_play: Callable[[str], list[Tried]] = lambda run: [],
     ) -> None:
         """`delete` moves the take of an id to the trash, `restore` brings it back.
 
-        `operator` tells the name of the person who drives, `runs_of` the runs that have learned a task.
+        `operator` tells the name of the person who drives, `runs_of` the runs that have learned a task,
+        `ways_to_play` how the chunks of a run may be played, the best first.
         """
         self._remote, self._delete, self._restore = remote, delete, restore
         self._operator = operator
-        self.runs_of = runs_of
-        self.policy = ""  # the run that drives where the choice is "policy"
+        self.runs_of, self.ways_to_play = runs_of, ways_to_play
+        self.policy, self.playing = "", Playing()  # the run that drives where the choice is "policy", and how
         self.countdown = 3.0  # [s] before recording
         self.with_sounds = True
         self.choice: Choice = "nobody"  # who was asked to drive last
@@ -95,6 +98,8 @@ class Desk:
                 driver="operator" if choice in ("gizmo", "keyboard") else choice,  # type: ignore[arg-type]
                 operator=self.operator,
                 policy=self.policy if choice == "policy" else "",
+                execution=self.playing.execution,
+                replan_every=self.playing.replan_every,
             )
         )
 

@@ -7,11 +7,11 @@ import viser
 from studio.messages import Status
 
 STEPS = (
+    ("Drive", "Choose <b>Gizmo</b> below and drag the arrows at a tool until it touches something."),
     (
-        "Drive",
-        "Choose <b>Gizmo</b> below and drag the arrows at the tool until the eraser touches the board.",
+        "Record",
+        "Press <kbd>R</kbd> or <b>Start take</b>, do what stands under <b>Take</b>, press <kbd>R</kbd> again.",
     ),
-    ("Record", "Press <kbd>R</kbd> or <b>Start take</b>, wipe the mark in one go, press <kbd>R</kbd> again."),
     ("Review", "Open your take under <b>Episodes</b> and see its forces."),
 )
 

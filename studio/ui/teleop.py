@@ -12,6 +12,7 @@ import viser
 
 from studio import tasks
 from studio.messages import ArmStatus, Status
+from studio.pilot import Playing, Tried
 from studio.tasks import ArmSetup
 from studio.ui.desk import CHOICES, Choice, Desk
 from studio.ui.keys import Keypad, is_shifted
@@ -136,18 +137,32 @@ _DRIVER_HINTS: dict[Choice, str] = {
 
 
 class _PolicyRow:
-    """The runs that have learned the task, and the button that lets one drive. Gone where there are none."""
+    """The runs that have learned the task, how one plays its chunks, and the button that lets it drive.
+
+    Gone where there are no runs.
+    """
 
     def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
         self._desk, self._looked = desk, -LOOK_EVERY
         self._task = ""
+        self._ways: dict[str, Playing] = {}
         self._row = _columns(gui, 2)
         self._run = gui.add_dropdown("Run", ("",), visible=False, hint="A trained policy of this task.")
         self._button = gui.add_button(LABELS["policy"], color=PASSIVE, visible=False)
+        self._way = gui.add_dropdown(
+            "Plays",
+            ("",),
+            visible=False,
+            hint="How much, before it looks again; first what did best when evaluated.",
+        )
 
         @self._run.on_update
         def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
-            desk.policy = self._run.value
+            self._choose(self._run.value)
+
+        @self._way.on_update
+        def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+            desk.playing = self._ways.get(self._way.value, desk.playing)
 
         on_click(self._button, partial(desk.drive, "policy"))
 
@@ -164,7 +179,29 @@ class _PolicyRow:
             chosen = self._run.value
             self._run.options = runs
             set_value(self._run, chosen if chosen in runs else runs[0])
-        self._desk.policy = self._run.value if runs else ""
+        self._choose(self._run.value if runs else "")
+
+    def _choose(self, run: str) -> None:
+        if run == self._desk.policy:
+            return
+        self._desk.policy = run
+        tried = self._desk.ways_to_play(run) if run else []
+        self._ways = {_words_of(one): one.playing for one in tried}
+        self._way.visible = bool(tried)
+        if tried:
+            self._way.options = tuple(self._ways)
+            set_value(self._way, self._way.options[0])
+            self._desk.playing = tried[0].playing
+
+
+def _words_of(tried: Tried) -> str:
+    """Of one way of playing chunks."""
+    playing = tried.playing
+    averages = playing.execution == "ensemble"
+    words = "average of all chunks" if averages else f"{playing.steps} steps of each chunk"
+    if averages and playing.steps > 1:
+        words += f", one each {playing.steps} steps"
+    return f"{words} ({tried.successes}/{tried.trials})" if tried.trials else words
 
 
 class _ArmRows:
