@@ -10,7 +10,7 @@ STEPS = (
     ("Drive", "Choose <b>Gizmo</b> below and drag the arrows at a tool until it touches something."),
     (
         "Record",
-        "Press <kbd>R</kbd> or <b>Start take</b>, do what stands under <b>Take</b>, press <kbd>R</kbd> again.",
+        "Press <kbd>R</kbd> or <b>Start take</b>, do what stands there, press <kbd>R</kbd> again.",
     ),
     ("Review", "Open your take under <b>Episodes</b> and see its forces."),
 )
