@@ -228,10 +228,15 @@ def test_two_processes_equal_one_with_the_double_batch(tmp_path: Path, dataset: 
     train(shared_config(4), dataset, tmp_path / "one")
     assert [process.wait(120) for process in pair] == [0, 0]
     one, two = weights(tmp_path / "one"), weights(tmp_path / "pair")
+    apart = {name: (two[name] - value).abs() for name, value in one.items()}
     for name, value in one.items():
-        if name.startswith("weight/"):
-            # Adam makes up to a step's length, 5e-4, of the rounding of a gradient near zero.
-            torch.testing.assert_close(two[name], value, rtol=1e-4, atol=1e-4, msg=name)
+        if name.startswith("exp_avg/"):  # what the gradients came to
+            assert apart[name].norm() <= 0.02 * value.norm(), name
+    # Adam makes up to a step's length, 5e-4, of the rounding of a gradient near zero; few differ so.
+    weight = {name: value for name, value in apart.items() if name.startswith("weight/")}
+    beyond = [(value > 1e-5 + 1e-4 * one[name].abs()).sum() for name, value in weight.items()]
+    assert sum(beyond) <= 1e-3 * sum(value.numel() for value in weight.values())
+    assert all(value.max() < 1e-4 for value in weight.values())
     losses = [[line["gradient"] for line in metrics(tmp_path / run)] for run in ("one", "pair")]
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-3)
 
