@@ -184,8 +184,8 @@ class _PolicyRow:
     def _choose(self, run: str) -> None:
         if run == self._desk.policy:
             return
-        self._desk.policy = run
         tried = self._desk.ways_to_play(run) if run else []
+        self._desk.policy = run
         self._ways = {_words_of(one): one.playing for one in tried}
         self._way.visible = bool(tried)
         if tried:
